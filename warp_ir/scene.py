@@ -1,0 +1,207 @@
+"""The scene as the host sees it: frozen records of NumPy arrays, no Warp, no USD.
+
+Everything is in world space and in scene units (whatever unit the stage uses: transport never
+needs to know). Matrices act on column vectors, ``world = matrix @ local``, and are float64 so that
+a scene far from the origin keeps its detail until it is uploaded.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+Color = tuple[float, float, float]
+Floats = npt.NDArray[np.floating]
+Ints = npt.NDArray[np.integer]
+
+
+class InputError(ValueError):
+    """The user's input cannot be rendered; the message is one line that says what and where."""
+
+
+class LightKind(IntEnum):
+    """The shapes a `Light` can have; the comment gives the local shape, as UsdLux defines it."""
+
+    RECT = 0  # width x height in the XY plane, emits along -Z
+    DISK = 1  # radius in the XY plane, emits along -Z
+    SPHERE = 2  # radius, emits outward
+    CYLINDER = 3  # length along X, radius; lateral surface, emits outward
+    POINT = 4  # the limit of a small sphere; emits the same intensity everywhere
+    DISTANT = 5  # shines along -Z from a cone of `angle` degrees (full angle); 0 = parallel
+    DOME = 6  # surrounds the scene
+
+
+class Projection(IntEnum):
+    """How a `Camera` maps points to its film."""
+
+    PERSPECTIVE = 0
+    ORTHOGRAPHIC = 1
+
+
+@dataclass(frozen=True)
+class Material:
+    """A Lambertian surface that may emit."""
+
+    name: str = ""
+    """Prim path, or any label for messages."""
+    albedo: Color = (0.18, 0.18, 0.18)
+    """Hemispherical reflectance ρ per channel, in [0, 1]."""
+    emission: Color = (0.0, 0.0, 0.0)
+    """Emitted radiance [W sr⁻¹ m⁻²], the same in all directions of the emitting side."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in world space.
+
+    Surfaces reflect and block on both sides. The winding (counter-clockwise seen from the front)
+    decides only which side emits, and where the geometric normal points.
+    """
+
+    name: str
+    """Prim path, or any label for messages."""
+    points: Floats
+    """float64 [n, 3], world space."""
+    triangles: Ints
+    """int32 [m, 3], indices into `points`, counter-clockwise seen from the front."""
+    material: Ints
+    """int32 [m], indices into `Scene.materials`."""
+    normals: Floats | None = None
+    """float32 [m, 3, 3], unit shading normals of the triangles' corners; None: faceted."""
+    colors: Floats | None = None
+    """float32 [m, 3, 3], albedo of the triangles' corners, in place of the material's; None: the material's."""
+    double_sided: bool = False
+    """Whether an emissive material emits from the back as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A light that is not a surface of the scene: it casts light, blocks none, reflects none."""
+
+    name: str
+    """Prim path, or any label for messages."""
+    kind: LightKind
+    """Which of the dimensions below count."""
+    radiance: Color
+    """Emitted radiance [W sr⁻¹ m⁻²]; for POINT the intensity [W sr⁻¹]; for DISTANT with angle 0 the
+    irradiance [W m⁻²] on a surface that faces the light."""
+    world_from_light: Floats = field(default_factory=lambda: np.eye(4))
+    """float64 [4, 4]; scale and shear allowed for the shapes with an area, ignored by DISTANT and DOME."""
+    width: float = 1.0
+    height: float = 1.0
+    radius: float = 0.5
+    length: float = 1.0
+    angle: float = 0.53
+    """Full angle of a DISTANT light's cone [degrees]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole or orthographic camera that looks along its -Z, with +Y up."""
+
+    name: str = ""
+    world_from_camera: Floats = field(default_factory=lambda: np.eye(4))
+    """float64 [4, 4], rotation and translation only."""
+    window: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
+    """left, right, bottom, top of the film: on the plane z = -1 (perspective) or in scene units."""
+    projection: Projection = Projection.PERSPECTIVE
+    clipping: tuple[float, float] = (0.0, math.inf)
+    """Nearest and farthest depth along -Z that camera rays see, in scene units."""
+    exposure: float = 1.0
+    """Linear factor on the film's radiance (UsdGeomCamera's exposure controls; 1 by default)."""
+
+    @property
+    def aspect(self) -> float:
+        """Width of the window over its height."""
+        left, right, bottom, top = self.window
+        return (right - left) / (top - bottom)
+
+    def fit(self, width: int, height: int) -> "Camera":
+        """This camera with its window grown to the aspect of an image (USD's `expandAperture`)."""
+        left, right, bottom, top = self.window
+        grow = (width / height) / self.aspect
+        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * max(grow, 1.0)
+        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * max(1.0 / grow, 1.0)
+        return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
+
+    @staticmethod
+    def look_at(
+        eye: Sequence[float],
+        target: Sequence[float],
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        *,
+        fov: float = 45.0,
+        aspect: float = 1.0,
+        name: str = "",
+    ) -> "Camera":
+        """A perspective camera at `eye` that looks at `target`.
+
+        Args:
+            eye: Position, scene units.
+            target: The point in the middle of the picture.
+            up: Any direction that is upright in the picture; not parallel to the view.
+            fov: Vertical field of view [degrees].
+            aspect: Width over height of the window.
+            name: A label for messages.
+        """
+        origin = np.asarray(eye, dtype=np.float64)
+        back = origin - np.asarray(target, dtype=np.float64)
+        right = np.cross(np.asarray(up, dtype=np.float64), back)
+        if not (np.linalg.norm(back) > 0.0 and np.linalg.norm(right) > 0.0):
+            raise InputError("camera: eye and target coincide, or up is parallel to the view")
+        back /= np.linalg.norm(back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = right, np.cross(back, right), back, origin
+        y = math.tan(math.radians(fov) / 2.0)
+        return Camera(name=name, world_from_camera=matrix, window=(-y * aspect, y * aspect, -y, y))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything a picture depends on, apart from the `RenderSettings`."""
+
+    meshes: tuple[Mesh, ...] = ()
+    materials: tuple[Material, ...] = (Material(),)
+    lights: tuple[Light, ...] = ()
+    camera: Camera = field(default_factory=Camera)
+    name: str = ""
+    """File or label the scene came from."""
+    warnings: tuple[str, ...] = ()
+    """What was skipped, approximated or guessed: one line each, beginning with the prim's path."""
+    stats: Mapping[str, int] = field(default_factory=dict)
+    """Counts of what was read and what was skipped, for `--stats` and `warp-ir info`."""
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles over all meshes."""
+        return sum(len(mesh.triangles) for mesh in self.meshes)
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper corner of the meshes' bounding box, float64 [3]; a unit cube if there are none."""
+        # Only points that a triangle uses count: stray points must not move the scene's frame.
+        used = [mesh.points[np.unique(mesh.triangles)] for mesh in self.meshes if len(mesh.triangles)]
+        if not used:
+            return np.full(3, -0.5), np.full(3, 0.5)
+        return np.min([p.min(axis=0) for p in used], axis=0), np.max([p.max(axis=0) for p in used], axis=0)
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the bounding box, in scene units: what relative lengths are relative to."""
+        lower, upper = self.bounds()
+        return float(np.linalg.norm(upper - lower))
+
+    def mean_albedo(self) -> float:
+        """Mean reflectivity ρ̄ of the surfaces, weighted by area, averaged over the channels (Keller 1997)."""
+        albedo = np.array([m.albedo for m in self.materials], dtype=np.float64).reshape(-1, 3).mean(axis=1)
+        total, reflected = 0.0, 0.0
+        for mesh in self.meshes:
+            a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
+            total += float(area.sum())
+            reflected += float(area @ rho)
+        return reflected / total if total > 0.0 else 0.0

@@ -1,0 +1,91 @@
+"""What the user can choose about a render: one frozen, validated record. The CLI's flags come from it."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from warp_ir.scene import InputError
+
+ESTIMATOR_NAMES = ("keller", "path")
+"""In the order in which help texts list them; the first is the default."""
+ABSORPTION_NAMES = ("roulette", "fractional")
+MAX_PIXELS = 1 << 28
+"""Above this an image is refused: at ~300 bytes a pixel it would need 80 GB."""
+
+
+def _setting(default: Any, doc: str, choices: tuple[str, ...] = ()) -> Any:
+    """A field whose documentation the CLI's ``--help`` shows."""
+    return field(default=default, metadata={"doc": doc, "choices": choices})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """How to render. Every value is checked on construction; `InputError` names the field."""
+
+    width: int = _setting(512, "width of the picture in pixels")
+    height: int | None = _setting(None, "height in pixels; by default from the camera's aspect")
+    iterations: int | None = _setting(None, "stop after this many iterations (64 if no other limit is given)")
+    time_limit: float | None = _setting(None, "stop after this many seconds of rendering")
+    target_error: float | None = _setting(
+        None, "stop when the estimated relative RMS error of the picture is below this"
+    )
+    light_paths: int = _setting(1024, "light paths per iteration; a power of two is best")
+    max_bounces: int | None = _setting(
+        None, "longest chain of reflections: 0 = direct light only, 1 = one more, ...; unlimited by default"
+    )
+    estimator: str = _setting(ESTIMATOR_NAMES[0], "which algorithm computes the light", ESTIMATOR_NAMES)
+    absorption: str | None = _setting(
+        None, "how light paths end; by default what the estimator was published with", ABSORPTION_NAMES
+    )
+    bound_radius: float = _setting(
+        0.0,
+        "keller only: bound the geometry term at 1/(R·extent)², R being this fraction of the scene's extent;"
+        " darkens corners; 0 = unbounded",
+    )
+    visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
+    seed: int = _setting(0, "seed of the random scrambling; the same seed gives the same bits")
+
+    def __post_init__(self) -> None:
+        """Checks every field."""
+        self._check_integer("width", 1)
+        self._check_integer("height", 1, optional=True)
+        self._check_integer("iterations", 1, optional=True)
+        self._check_integer("light_paths", 1, 1 << 24)
+        self._check_integer("max_bounces", 0, optional=True)
+        self._check_integer("seed", 0, (1 << 32) - 1)
+        for name in ("time_limit", "target_error"):
+            self._check(name, getattr(self, name) is None or _positive(getattr(self, name)), "a positive number")
+        self._check("bound_radius", self.bound_radius == 0 or _positive(self.bound_radius), "a number of at least 0")
+        self._check("estimator", self.estimator in ESTIMATOR_NAMES, f"one of {', '.join(ESTIMATOR_NAMES)}")
+        self._check(
+            "absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}"
+        )
+        self._check(
+            "width", self.width * (self.height or 1) <= MAX_PIXELS, f"small enough: at most {MAX_PIXELS} pixels in all"
+        )
+
+    @property
+    def iteration_limit(self) -> float:
+        """Iterations after which to stop: as set; 64 if nothing is set; else unlimited."""
+        if self.iterations is not None:
+            return self.iterations
+        return 64 if self.time_limit is None and self.target_error is None else math.inf
+
+    def _check(self, name: str, good: bool, wanted: str) -> None:
+        if not good:
+            raise InputError(f"{name}: must be {wanted}, is {getattr(self, name)!r}")
+
+    def _check_integer(self, name: str, least: int, most: int = 2**31 - 1, *, optional: bool = False) -> None:
+        value = getattr(self, name)
+        good = isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+        limit = f" and at most {most}" if most < 2**31 - 1 else ""
+        self._check(name, good or (optional and value is None), f"a whole number of at least {least}{limit}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain values, for metadata and statistics."""
+        return dataclasses.asdict(self)
+
+
+def _positive(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < math.inf
