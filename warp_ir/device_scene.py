@@ -1,0 +1,399 @@
+"""The scene as the kernels see it, and the one function that puts it there.
+
+On the device the scene lives in its own frame: centred on the middle of its bounding box and scaled by
+a power of two until its extent is between 1/2 and 1. Radiance does not change when a scene is scaled,
+so nothing else has to know; and a scene in millimetres, or far from the origin, is as exact as any.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ir import sampling
+from warp_ir.launch import Launcher
+from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Projection, Scene
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_TRIANGLES = 200_000_000
+"""Above this a scene is refused before anything is allocated (~200 bytes a triangle)."""
+_TRIANGLE_EMITTER = len(LightKind)
+"""Kind of an emitter that is a triangle of an emissive mesh; the kinds below it are `LightKind`'s."""
+
+
+@wp.struct
+class SceneData:
+    """Geometry, materials and emitters. Empty tables hold one unused row; the counts tell."""
+
+    mesh: wp.uint64  # every surface in one BVH; valid even if there is none
+    triangle_count: int
+    points: wp.array[wp.vec3]
+    indices: wp.array[wp.int32]  # [3 m]
+    triangle_material: wp.array[wp.int32]  # [m]
+    triangle_mesh: wp.array[wp.int32]  # [m], index into Scene.meshes
+    triangle_normals: wp.array[wp.int32]  # [m], first of its three rows in corner_normals; -1: faceted
+    triangle_colors: wp.array[wp.int32]  # [m], first of its three rows in corner_colors; -1: the material's
+    corner_normals: wp.array[wp.vec3]
+    corner_colors: wp.array[wp.vec3]
+    albedo: wp.array[wp.vec3]  # [materials]
+    emission: wp.array[wp.vec3]  # [materials] radiance
+    emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
+    radius: float  # of a sphere around the origin that holds all surfaces
+
+    emitter_count: int
+    emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1
+    emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or _TRIANGLE_EMITTER
+    emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
+    triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no surface emits
+
+    light_count: int  # analytic lights
+    light_kind: wp.array[wp.int32]
+    light_origin: wp.array[wp.vec3]
+    light_axes: wp.array[wp.mat33]  # columns: what the unit shape's x, y, z become; rotation for DISTANT
+    light_inverse: wp.array[wp.mat33]
+    light_radiance: wp.array[wp.vec3]
+    light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
+    light_emitter: wp.array[wp.int32]  # its row in the emitter tables, or -1
+    shape_count: int  # lights with an area: RECT to CYLINDER
+    shape_bvh: wp.uint64  # boxes around them
+    shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
+
+    sobol: wp.array[wp.uint32]
+
+
+@wp.struct
+class CameraData:
+    """A camera in the scene's device frame."""
+
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    back: wp.vec3
+    left: float
+    bottom: float
+    width: float
+    height: float
+    near: float
+    far: float
+    orthographic: int
+
+
+@dataclass(frozen=True)
+class DeviceFrame:
+    """Where the device's frame lies: device = (world - origin) * scale, scale a power of two."""
+
+    origin: npt.NDArray[np.float64]
+    scale: float
+
+    def to_device(self, points: Any) -> npt.NDArray[np.float32]:
+        """World positions [..., 3] in the device's frame, float32."""
+        return ((np.asarray(points, np.float64) - self.origin) * self.scale).astype(np.float32)
+
+    def to_world(self, points: Any) -> npt.NDArray[np.float64]:
+        """Device positions [..., 3] in world space."""
+        return np.asarray(points, np.float64) / self.scale + self.origin
+
+
+@dataclass(frozen=True)
+class DeviceScene:
+    """An uploaded scene; owns what `data` refers to by id."""
+
+    data: Any
+    """The `SceneData` for kernels."""
+    frame: DeviceFrame
+    extent: float
+    """Diagonal of the bounding box in the device's frame."""
+    mean_albedo: float
+    """Mean reflectivity ρ̄ of the surfaces."""
+    max_albedo: float
+    """Largest albedo of any surface and channel."""
+    emits: bool
+    """Whether anything in the scene emits."""
+    keep: tuple[Any, ...]
+    """The mesh and BVH objects: a struct holds only their ids, and a freed id crashes."""
+
+
+def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
+    """Checks a scene and copies it to the launcher's device.
+
+    Raises:
+        InputError: An array has the wrong shape or a bad value; the message names the mesh or light.
+    """
+    with launcher.phase("upload"):
+        _check(scene)
+        lower, upper = scene.bounds()
+        extent = float(np.linalg.norm(upper - lower))
+        if not np.isfinite(extent):
+            raise InputError("scene: its extent is too large for a float")
+        # Rooms of exactly 2^k units must not jump between scales by rounding: frexp is exact.
+        scale = 2.0 ** -math.frexp(extent)[1] if extent > 0.0 else 1.0
+        frame = DeviceFrame(0.5 * (lower + upper), scale)
+
+        data = SceneData()
+        data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
+        mesh = _upload_surfaces(scene, frame, data, launcher)
+        shapes = _upload_lights(scene.lights, frame, data, launcher)
+        _upload_emitters(scene, frame, data, launcher)
+        data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+        colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
+        used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
+        return DeviceScene(
+            data=data,
+            frame=frame,
+            extent=extent * scale if extent > 0.0 else 1.0,
+            mean_albedo=scene.mean_albedo(),
+            max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
+            emits=data.emitter_count > 0,
+            keep=(mesh, shapes),
+        )
+
+
+def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int) -> Any:
+    """The `CameraData` of a camera fitted to an image.
+
+    Raises:
+        InputError: The window is empty, or something is not finite.
+    """
+    camera = camera.fit(width, height)
+    left, right, bottom, top = camera.window
+    if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.window).all()):
+        raise InputError(f"camera {camera.name!r}: transform and window must be finite")
+    if not (right > left and top > bottom):
+        raise InputError(f"camera {camera.name!r}: the window is empty")
+    unit = 1.0 if camera.projection == Projection.PERSPECTIVE else frame.scale
+    out = CameraData()
+    out.origin = wp.vec3(*frame.to_device(camera.world_from_camera[:3, 3]))
+    out.right, out.up, out.back = (wp.vec3(*camera.world_from_camera[:3, k]) for k in range(3))
+    out.left, out.bottom = left * unit, bottom * unit
+    out.width, out.height = (right - left) * unit, (top - bottom) * unit
+    out.near = camera.clipping[0] * frame.scale
+    out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
+    out.orthographic = int(camera.projection == Projection.ORTHOGRAPHIC)
+    return out
+
+
+def _check(scene: Scene) -> None:
+    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here."""
+    if scene.triangle_count > MAX_TRIANGLES:
+        raise InputError(f"scene: {scene.triangle_count} triangles; the limit is {MAX_TRIANGLES}")
+    for mesh in scene.meshes:
+        _check_mesh(mesh, len(scene.materials))
+    for material in scene.materials:
+        if not all(0.0 <= a <= 1.0 for a in material.albedo):
+            raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
+        if not all(0.0 <= e < np.inf for e in material.emission):
+            raise InputError(f"{material.name}: emission must be finite and not negative, is {material.emission}")
+    for light in scene.lights:
+        if not all(0.0 <= e < np.inf for e in light.radiance):
+            raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
+        if light.world_from_light.shape != (4, 4) or not np.isfinite(light.world_from_light).all():
+            raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
+
+
+def _check_mesh(mesh: Mesh, material_count: int) -> None:
+    count = len(mesh.triangles)
+
+    def demand(good: Any, what: str) -> None:
+        if not good:
+            raise InputError(f"{mesh.name}: {what}")
+
+    demand(mesh.points.ndim == 2 and mesh.points.shape[1] == 3, "points must have shape [n, 3]")
+    demand(mesh.triangles.shape == (count, 3), "triangles must have shape [m, 3]")
+    demand(mesh.material.shape == (count,), "material must have shape [m], one index per triangle")
+    if count:
+        demand(
+            mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.points),
+            f"triangles refer to points outside 0..{len(mesh.points) - 1}",
+        )
+        demand(
+            mesh.material.min() >= 0 and mesh.material.max() < material_count,
+            f"material refers to materials outside 0..{material_count - 1}",
+        )
+        demand(np.isfinite(mesh.points[mesh.triangles]).all(), "points must be finite")
+    for name, corners in (("normals", mesh.normals), ("colors", mesh.colors)):
+        if corners is not None:
+            demand(corners.shape == (count, 3, 3), f"{name} must have shape [m, 3, 3]")
+            demand(np.isfinite(corners).all(), f"{name} must be finite")
+    if mesh.colors is not None and count:
+        demand(mesh.colors.min() >= 0.0 and mesh.colors.max() <= 1.0, "colors must lie in [0, 1]")
+
+
+def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
+    """Fills the geometry and material tables; returns the BVH's owner."""
+    meshes = [m for m in scene.meshes if len(m.triangles)]
+    data.triangle_count = sum(len(m.triangles) for m in meshes)
+    if meshes:
+        first = np.cumsum([0, *(len(m.points) for m in meshes[:-1])])
+        points = np.concatenate([frame.to_device(m.points) for m in meshes])
+        # A stray point that no triangle uses may be anything: keep it from the bounds and the compiler.
+        points[~np.isfinite(points).all(axis=1)] = 0.0
+        indices = np.concatenate([(m.triangles + f).reshape(-1) for m, f in zip(meshes, first, strict=True)])
+        material = np.concatenate([m.material for m in meshes])
+    else:
+        # An empty mesh crashes Warp; three coincident points are never hit.
+        points, indices, material = np.zeros((3, 3)), np.arange(3), np.zeros(1)
+    data.points = launcher.array(points, wp.vec3)
+    data.indices = launcher.array(indices.astype(np.int32), wp.int32)
+    data.triangle_material = launcher.array(material.astype(np.int32), wp.int32)
+    owner = [k for k, m in enumerate(scene.meshes) for _ in range(min(len(m.triangles), 1))]
+    counts = [len(m.triangles) for m in meshes]
+    data.triangle_mesh = launcher.array(np.repeat(owner, counts).astype(np.int32) if meshes else [-1], wp.int32)
+    data.emits_back = launcher.array(
+        np.repeat([m.double_sided for m in meshes], counts).astype(np.int32) if meshes else [0], wp.int32
+    )
+    data.triangle_normals, data.corner_normals = _upload_corners([m.normals for m in meshes], counts, launcher)
+    data.triangle_colors, data.corner_colors = _upload_corners([m.colors for m in meshes], counts, launcher)
+    data.albedo = launcher.array([m.albedo for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
+    data.emission = launcher.array([m.emission for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
+    mesh = wp.Mesh(data.points, data.indices, bvh_constructor="sah", bvh_leaf_size=2)
+    data.mesh = mesh.id
+    return mesh
+
+
+def _upload_corners(corners: list[Any], counts: list[int], launcher: Launcher) -> tuple[Any, Any]:
+    """Per-triangle offsets (-1: none) into one table of the corner values of the meshes that have them."""
+    rows = np.full(max(sum(counts), 1), -1, np.int32)
+    values, triangle, row = [], 0, 0
+    for corner, count in zip(corners, counts, strict=True):
+        if corner is not None:
+            rows[triangle : triangle + count] = row + 3 * np.arange(count)
+            values.append(corner.reshape(-1, 3))
+            row += 3 * count
+        triangle += count
+    table = np.concatenate(values) if values else np.zeros((1, 3))
+    return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), wp.vec3)
+
+
+def _upload_lights(lights: tuple[Light, ...], frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
+    """Fills the light tables; returns the owner of the BVH over the lights with an area."""
+    axes = np.array([_light_axes(light) * _unit(light, frame) for light in lights]).reshape(-1, 3, 3)
+    origin = frame.to_device(np.array([light.world_from_light[:3, 3] for light in lights]).reshape(-1, 3))
+    radiance = np.array([light.radiance for light in lights], np.float64).reshape(-1, 3)
+    points = np.array([light.kind == LightKind.POINT for light in lights], bool)
+    radiance[points] *= frame.scale**2  # intensity is radiance times area
+    angle = [1.0 - math.cos(math.radians(0.5 * min(max(light.angle, 0.0), 360.0))) for light in lights]
+
+    data.light_count = len(lights)
+    data.light_kind = launcher.array([int(light.kind) for light in lights] or [0], wp.int32)
+    data.light_origin = launcher.array(_rows(origin), wp.vec3)
+    data.light_axes = launcher.array(_rows(axes, (3, 3)), wp.mat33)
+    data.light_inverse = launcher.array(_rows(np.array([_inverse(a) for a in axes]), (3, 3)), wp.mat33)
+    data.light_radiance = launcher.array(_rows(radiance), wp.vec3)
+    data.light_angle = launcher.array(angle or [0.0], wp.float32)
+
+    shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
+    reach = np.abs(axes[shapes]).sum(axis=2) * 1.001 if shapes else np.zeros((1, 3))
+    centre = origin[shapes] if shapes else np.full((1, 3), 1.0e6)
+    data.shape_count = len(shapes)
+    data.shape_light = launcher.array(shapes or [0], wp.int32)
+    bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
+    data.shape_bvh = bvh.id
+    return bvh
+
+
+def _rows(table: Any, shape: tuple[int, ...] = (3,)) -> Any:
+    """The table, or one row of zeros where it is empty: kernels never get a null pointer."""
+    return np.asarray(table, np.float32) if len(table) else np.zeros((1, *shape), np.float32)
+
+
+def _unit(light: Light, frame: DeviceFrame) -> float:
+    return frame.scale if light.kind <= LightKind.CYLINDER else 1.0
+
+
+def _light_axes(light: Light) -> npt.NDArray[np.float64]:
+    """Columns: the images of the unit shape's axes; for the flat shapes z is the unit emitting normal."""
+    linear = light.world_from_light[:3, :3].astype(np.float64)
+    if light.kind in (LightKind.RECT, LightKind.DISK):
+        size = (light.width, light.height) if light.kind == LightKind.RECT else (light.radius, light.radius)
+        x, y = linear[:, 0] * size[0], linear[:, 1] * size[1]
+        normal = -np.cross(x, y) * (-1.0 if np.linalg.det(linear) < 0.0 else 1.0)
+        length = np.linalg.norm(normal)
+        if not length > 0.0:
+            raise InputError(f"{light.name}: the light has no area")
+        return np.stack([x, y, normal / length], axis=1)
+    if light.kind == LightKind.SPHERE:
+        return linear * light.radius
+    if light.kind == LightKind.CYLINDER:
+        return linear * np.array([light.length, light.radius, light.radius])
+    rotation = np.linalg.qr(linear)[0] if np.linalg.det(linear) != 0.0 else np.eye(3)
+    return rotation * np.where(np.sum(rotation * linear, axis=0) < 0.0, -1.0, 1.0)
+
+
+def _inverse(axes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    try:
+        return np.linalg.inv(axes)
+    except np.linalg.LinAlgError:
+        return np.zeros((3, 3))  # collapsed to a plane: it still emits, but no ray can find it
+
+
+def _upload_emitters(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> None:
+    """One list of everything that emits, with the probabilities of choosing each: in proportion to its power.
+
+    Any positive probabilities are right; a power is estimated from mean radiance times area, no more.
+    """
+    kinds: list[npt.NDArray[np.int32]] = []
+    items: list[npt.NDArray[np.int32]] = []
+    powers: list[npt.NDArray[np.float64]] = []
+    radiance = data.light_radiance.numpy()
+    axes = data.light_axes.numpy()
+    for k, light in enumerate(scene.lights):
+        power = float(np.mean(radiance[k], dtype=np.float64)) * _power_per_radiance(light, axes[k], data.radius)
+        kinds.append(np.array([light.kind], np.int32))
+        items.append(np.array([k], np.int32))
+        powers.append(np.array([power]))
+
+    emission = np.array([m.emission for m in scene.materials], np.float64).reshape(-1, 3).mean(axis=1)
+    first = 0
+    for mesh in scene.meshes:
+        glowing = np.nonzero(emission[mesh.material] > 0.0)[0] if emission.any() else np.zeros(0, np.int64)
+        if len(glowing):
+            a, b, c = (mesh.points[mesh.triangles[glowing, k]] * frame.scale for k in range(3))
+            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            sides = 2.0 if mesh.double_sided else 1.0
+            kinds.append(np.full(len(glowing), _TRIANGLE_EMITTER, np.int32))
+            items.append((first + glowing).astype(np.int32))
+            powers.append(math.pi * sides * area * emission[mesh.material[glowing]])
+        first += len(mesh.triangles)
+
+    kind, item, power = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers))
+    on = power > 0.0
+    kind, item, power = kind[on], item[on], power[on]
+    data.emitter_count = len(power)
+    cdf = np.concatenate([[0.0], np.cumsum(power / power.sum())]) if len(power) else np.array([0.0, 1.0])
+    cdf[-1] = 1.0
+    data.emitter_cdf = launcher.array(cdf, wp.float32)
+    data.emitter_kind = launcher.array(kind.astype(np.int32) if len(kind) else [0], wp.int32)
+    data.emitter_item = launcher.array(item.astype(np.int32) if len(item) else [0], wp.int32)
+
+    emitter = np.arange(len(power), dtype=np.int32)
+    light_emitter = np.full(max(len(scene.lights), 1), -1, np.int32)
+    analytic = kind != _TRIANGLE_EMITTER
+    light_emitter[item[analytic].astype(np.int64)] = emitter[analytic]
+    data.light_emitter = launcher.array(light_emitter, wp.int32)
+    triangle_emitter = np.full(data.triangle_count if (~analytic).any() else 1, -1, np.int32)
+    triangle_emitter[item[~analytic].astype(np.int64)] = emitter[~analytic]
+    data.triangle_emitter = launcher.array(triangle_emitter, wp.int32)
+
+
+def _power_per_radiance(light: Light, axes: Any, radius: float) -> float:
+    """Flux into the scene [device units] per mean radiance: exact for flat lights, good enough for the others."""
+    x, y, z = (float(np.linalg.norm(axes[:, k])) for k in range(3))
+    disk = math.pi * radius**2
+    if light.kind == LightKind.RECT:
+        return math.pi * float(np.linalg.norm(np.cross(axes[:, 0], axes[:, 1])))
+    if light.kind == LightKind.DISK:
+        return math.pi * math.pi * float(np.linalg.norm(np.cross(axes[:, 0], axes[:, 1])))
+    if light.kind == LightKind.SPHERE:
+        return math.pi * 4.0 * math.pi * (x * y + y * z + z * x) / 3.0
+    if light.kind == LightKind.CYLINDER:
+        return math.pi * x * math.pi * (y + z)
+    if light.kind == LightKind.POINT:
+        return 4.0 * math.pi
+    if light.kind == LightKind.DOME:
+        return 4.0 * math.pi * disk
+    cone = 2.0 * math.pi * (1.0 - math.cos(math.radians(0.5 * light.angle)))
+    return disk * (cone if light.angle > 0.0 else 1.0)

@@ -1,0 +1,29 @@
+"""The ways to compute the light. Each is one file with one verb: add one iteration to a film.
+
+An estimator is built as ``Estimator(scene, camera, settings, launcher, size)`` from an uploaded scene, a
+`CameraData` and a (width, height), and then ``estimate(iteration, gbuffer, direct, indirect)`` fills, for
+every pixel, the radiance that reaches the camera directly (emitted, or reflected once) and indirectly.
+What it computes depends on these arguments alone.
+"""
+
+from typing import Any, Protocol
+
+from warp_ir.device_scene import DeviceScene
+from warp_ir.estimators.keller import Keller
+from warp_ir.estimators.path import PathTracer
+from warp_ir.launch import Launcher
+from warp_ir.settings import RenderSettings
+
+
+class Estimator(Protocol):
+    """One way to compute the light."""
+
+    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
+        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
+
+    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
+        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+
+
+ESTIMATORS: dict[str, type[Estimator]] = {"keller": Keller, "path": PathTracer}
+"""By the names that `RenderSettings.estimator` takes."""

@@ -1,0 +1,112 @@
+"""Instant radiosity as published (Keller 1997, "Instant Radiosity", SIGGRAPH).
+
+The radiance that a surface point x sends to the eye is what it emits plus the light of the whole Neumann
+series, reflected once more: L = Le + R Le + R² Le + ... Sample that series *once*: start N light paths on the
+lights, and keep every vertex y_k as a virtual point light of intensity I_k. Then for every visible point
+
+    L(x) = Le(x) + ρ(x)/π · Σ_k I_k G(x, y_k) V(x, y_k),      G = cos⁺θ_x cos⁺θ_y / |x - y|²
+
+In the paper the sum is N pictures, each rendered by graphics hardware with one point light and its shadows,
+added in the accumulation buffer. Here it is a loop over the VPLs at every pixel, with a shadow ray for V.
+
+Paths need not be killed one by one: of N, the first ⌊ρ̄ʲN⌋ are reflected j times, ρ̄ being the scene's
+mean reflectivity (fractional absorption), which keeps their low-discrepancy points in order. Every iteration
+jitters the camera rays and renews the VPLs; the picture is the mean of the iterations.
+
+Nothing here is clever, and that is the point: it is the page to read first, and the baseline to beat.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.launch import Launcher
+from warp_ir.sampling import iteration_scramble
+from warp_ir.settings import RenderSettings
+from warp_ir.surface import visible
+from warp_ir.vpl import VplBuffer, emit_vpls
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def geometry_term(
+    position: wp.vec3, normal: wp.vec3, shading_normal: wp.vec3, vpl_position: wp.vec4, vpl_normal: wp.vec4
+) -> float:
+    """G between a surface point and a VPL; for a directional one (w = 0), the cosine at the point alone."""
+    xyz = wp.vec3(vpl_position[0], vpl_position[1], vpl_position[2])
+    to_vpl = xyz - position * vpl_position[3]
+    squared = wp.dot(to_vpl, to_vpl)
+    direction = to_vpl / wp.sqrt(squared)
+    if wp.dot(normal, direction) <= 0.0:
+        return 0.0  # behind the surface, whatever the interpolated normal says
+    at_point = wp.max(0.0, wp.dot(shading_normal, direction))
+    vpl_facing = wp.vec3(vpl_normal[0], vpl_normal[1], vpl_normal[2])
+    at_vpl = wp.max(0.0, vpl_normal[3] - wp.dot(vpl_facing, direction))
+    return at_point * at_vpl / squared
+
+
+@wp.kernel
+def _accumulate(
+    first: int,
+    scene: SceneData,
+    gbuffer: GBuffer,
+    vpls: VplBuffer,
+    bound: float,
+    direct: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+):
+    """L = Le + ρ/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others."""
+    pixel = first + wp.tid()
+    from_lights = wp.vec3(0.0)
+    from_surfaces = wp.vec3(0.0)
+    rho = gbuffer.albedo[pixel]
+    if gbuffer.mesh[pixel] >= 0 and wp.max(rho) > 0.0:
+        position = gbuffer.position[pixel]
+        for k in range(vpls.count):
+            g = geometry_term(
+                position, gbuffer.normal[pixel], gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k]
+            )
+            if g > 0.0 and visible(scene, position, vpls.position[k]):
+                irradiance = vpls.intensity[k] * wp.min(g, bound)
+                if vpls.bounce[k] == 0:
+                    from_lights += irradiance
+                else:
+                    from_surfaces += irradiance
+        from_lights = wp.cw_mul(from_lights, rho) / wp.pi
+        from_surfaces = wp.cw_mul(from_surfaces, rho) / wp.pi
+    direct[pixel] = gbuffer.emission[pixel] + from_lights
+    indirect[pixel] = from_surfaces
+
+
+class Keller:
+    """Every VPL, every shadow ray."""
+
+    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
+        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
+        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+        radius = settings.bound_radius * scene.extent
+        self._bound = 1.0 / radius**2 if radius > 0.0 else 3.0e38
+
+    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
+        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+        settings, launcher = self._settings, self._launcher
+        with launcher.phase("primary"):
+            trace_primary(self._scene, self._camera, launcher, gbuffer, settings=settings, iteration=iteration)
+        with launcher.phase("emission"):
+            vpls = emit_vpls(
+                self._scene,
+                launcher,
+                paths=settings.light_paths,
+                absorption=settings.absorption or "fractional",
+                max_bounces=settings.max_bounces,
+                scramble=iteration_scramble(settings.seed, iteration),
+            )
+        with launcher.phase("gather"):
+            launcher.launch(
+                _accumulate,
+                gbuffer.mesh.shape[0],
+                [self._scene.data, gbuffer, vpls, self._bound, direct, indirect],
+            )

@@ -1,0 +1,139 @@
+"""Path tracing, the independent truth: from the eye, one path per pixel and iteration.
+
+At every vertex the lights are sampled once (next-event estimation), and the direction in which the path goes
+on may hit one as well; the two are weighted by the balance heuristic (Veach 1997). Paths end by Russian
+roulette on the local albedo. It shares ray queries and scene tables with the VPLs, and no transport.
+
+Surfaces are shaded with interpolated normals where the camera sees them, and with the triangles' own
+where light bounces between them, as the VPLs do: so energy is conserved and both compute the same integral.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_ir import sampling
+from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.launch import Launcher
+from warp_ir.lights import LightPoint, lights_along, sample_light, surface_weight
+from warp_ir.settings import RenderSettings
+from warp_ir.surface import albedo, closest, emission, visible
+
+wp.set_module_options({"enable_backward": False})
+
+_MAX_SURVIVAL = wp.constant(0.999)
+_UNLIMITED = 2**31 - 1
+
+
+@wp.func
+def _light_at(
+    scene: SceneData, position: wp.vec3, normal: wp.vec3, shading_normal: wp.vec3, light: LightPoint
+) -> wp.vec3:
+    """Weighted irradiance over π at a point from one sample of the lights."""
+    xyz = wp.vec3(light.position[0], light.position[1], light.position[2])
+    to_light = xyz - position * light.position[3]
+    squared = wp.dot(to_light, to_light)
+    direction = to_light / wp.sqrt(squared)
+    at_point = wp.dot(shading_normal, direction)
+    at_light = light.normal[3] - wp.dot(wp.vec3(light.normal[0], light.normal[1], light.normal[2]), direction)
+    if at_point <= 0.0 or at_light <= 0.0 or wp.dot(normal, direction) <= 0.0:
+        return wp.vec3(0.0)
+    if not visible(scene, position, light.position):
+        return wp.vec3(0.0)
+    # Densities per solid angle of the two ways to find this light; a delta light has only one (density 0).
+    by_light = light.density * squared / at_light
+    by_bsdf = at_point / wp.pi
+    weight = float(1.0)
+    if light.density > 0.0:
+        weight = by_light / (by_light + by_bsdf)
+    return light.intensity * (weight * at_point * at_light / (squared * wp.pi))
+
+
+@wp.kernel
+def _trace_paths(
+    first: int,
+    scene: SceneData,
+    gbuffer: GBuffer,
+    scramble: wp.uint32,
+    max_bounces: int,
+    direct: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+):
+    """Follows one path from what the camera sees at a pixel."""
+    pixel = first + wp.tid()
+    once = gbuffer.emission[pixel]
+    more = wp.vec3(0.0)
+    if gbuffer.mesh[pixel] >= 0 and scene.emitter_count > 0:
+        stream = sampling.hash_combine(scramble, wp.uint32(pixel))
+        position = gbuffer.position[pixel]
+        normal = gbuffer.normal[pixel]
+        shading_normal = gbuffer.shading_normal[pixel]
+        throughput = gbuffer.albedo[pixel]
+        bounce = int(0)  # reflections between this vertex's light and the camera, less one
+        dimension = int(0)
+        while wp.max(throughput) > 0.0:
+            u = sampling.sample_1d(scene.sobol, 0, dimension, stream)
+            light = sample_light(scene, u, sampling.sample_2d(scene.sobol, 0, dimension + 1, stream))
+            found = wp.cw_mul(throughput, _light_at(scene, position, normal, shading_normal, light))
+
+            # The way on: lights it meets count here, the surface it meets is the next vertex.
+            u2 = sampling.sample_2d(scene.sobol, 0, dimension + 3, stream)
+            direction = sampling.to_cosine_hemisphere(u2, shading_normal)
+            above = wp.dot(direction, normal) > 0.0
+            density = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
+            hit = closest(scene, position, direction, 3.0e38)
+            if above:
+                reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
+                seen = lights_along(scene, position, direction, reach, hit.triangle < 0, density)
+                if hit.triangle >= 0:
+                    emitted = emission(scene, hit)
+                    if wp.max(emitted) > 0.0:
+                        seen += emitted * surface_weight(scene, hit, direction, density)
+                found += wp.cw_mul(throughput, seen)
+            if bounce == 0:
+                once += found
+            else:
+                more += found
+
+            bounce += 1
+            if bounce > max_bounces or hit.triangle < 0 or not above:
+                break
+            rho = albedo(scene, hit)
+            survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
+            if sampling.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
+                break
+            throughput = wp.cw_mul(throughput, rho) / survival
+            position = hit.position
+            normal = hit.normal
+            shading_normal = hit.normal
+            dimension += 6
+    direct[pixel] = once
+    indirect[pixel] = more
+
+
+class PathTracer:
+    """Unidirectional path tracing with next-event estimation."""
+
+    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
+        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
+        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+
+    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
+        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+        settings, launcher = self._settings, self._launcher
+        with launcher.phase("primary"):
+            trace_primary(self._scene, self._camera, launcher, gbuffer, settings=settings, iteration=iteration)
+        with launcher.phase("gather"):
+            launcher.launch(
+                _trace_paths,
+                gbuffer.mesh.shape[0],
+                [
+                    self._scene.data,
+                    gbuffer,
+                    wp.uint32(sampling.iteration_scramble(settings.seed, iteration)),
+                    _UNLIMITED if settings.max_bounces is None else settings.max_bounces,
+                    direct,
+                    indirect,
+                ],
+            )

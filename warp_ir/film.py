@@ -1,0 +1,236 @@
+"""The film: a sum, a sum of squares and a count. Iterations add, films merge, the picture is the mean.
+
+Sums are float64, so that a hundred thousand iterations leave no drift.
+"""
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ir.gbuffer import GBuffer
+from warp_ir.launch import Launcher
+from warp_ir.scene import InputError
+
+wp.set_module_options({"enable_backward": False})
+
+AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
+"""What `Film.aov` can give beside the radiance."""
+Image = npt.NDArray[Any]
+
+
+@wp.struct
+class FilmData:
+    """Sums over iterations, one row per pixel."""
+
+    direct: wp.array[wp.vec3d]  # emission and light reflected once
+    indirect: wp.array[wp.vec3d]
+    squares: wp.array[wp.vec3d]  # of direct + indirect
+    albedo: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    position: wp.array[wp.vec3]
+    depth: wp.array[wp.float32]
+    hits: wp.array[wp.int32]  # iterations in which the pixel's ray met a surface
+    rejected: wp.array[wp.int32]  # iterations whose value was not finite
+    mesh: wp.array[wp.int32]  # what the first iteration saw
+
+
+@wp.func
+def _finite(v: wp.vec3) -> bool:
+    return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
+
+
+@wp.kernel
+def _add(
+    first: int,
+    gbuffer: GBuffer,
+    direct: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+    exposure: float,
+    is_first: int,
+    film: FilmData,
+):
+    """Adds one iteration's estimate of every pixel."""
+    i = first + wp.tid()
+    d = direct[i] * exposure
+    m = indirect[i] * exposure
+    total = d + m
+    if _finite(total):
+        x = wp.vec3d(wp.float64(total[0]), wp.float64(total[1]), wp.float64(total[2]))
+        film.direct[i] += wp.vec3d(wp.float64(d[0]), wp.float64(d[1]), wp.float64(d[2]))
+        film.indirect[i] += wp.vec3d(wp.float64(m[0]), wp.float64(m[1]), wp.float64(m[2]))
+        film.squares[i] += wp.cw_mul(x, x)
+    else:
+        film.rejected[i] += 1
+    if is_first == 1:
+        film.mesh[i] = gbuffer.mesh[i]
+    if gbuffer.mesh[i] >= 0:
+        film.hits[i] += 1
+        film.albedo[i] += gbuffer.albedo[i]
+        film.normal[i] += gbuffer.shading_normal[i]
+        film.position[i] += gbuffer.position[i]
+        film.depth[i] += gbuffer.depth[i]
+
+
+class Film:
+    """What a render has gathered so far. `render` makes one; `merge` adds another of the same picture."""
+
+    AOV_NAMES = AOV_NAMES
+
+    def __init__(self, width: int, height: int, launcher: Launcher, frame: Any = None) -> None:
+        """An empty film on the launcher's device; `frame` (a `DeviceFrame`) takes positions back to the world."""
+        self.width, self.height = width, height
+        self.iterations = 0
+        """Iterations added."""
+        self.seconds = 0.0
+        """Wall time of rendering them [s], without loading and compiling."""
+        self.interrupted = False
+        """Whether a signal ended the render before its limit."""
+        self.settings: Any = None
+        """The `RenderSettings` it was rendered with."""
+        self.timings: dict[str, float] = {}
+        """Seconds by phase."""
+        self.counts: dict[str, int] = {}
+        """Rays, VPLs, ... of all iterations."""
+        self._frame = frame
+        self._launcher = launcher
+        data = FilmData()
+        pixels = width * height
+        for name in ("direct", "indirect", "squares"):
+            setattr(data, name, launcher.zeros(pixels, wp.vec3d))
+        for name in ("albedo", "normal", "position"):
+            setattr(data, name, launcher.zeros(pixels, wp.vec3))
+        data.depth = launcher.zeros(pixels, wp.float32)
+        for name in ("hits", "rejected", "mesh"):
+            setattr(data, name, launcher.zeros(pixels, wp.int32))
+        self._data = data
+
+    def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0) -> None:
+        """Adds one iteration: what the camera saw, and the radiance estimated for it."""
+        self._launcher.launch(
+            _add,
+            self.width * self.height,
+            [gbuffer, direct, indirect, exposure, int(self.iterations == 0), self._data],
+        )
+        self.iterations += 1
+
+    def merge(self, other: "Film") -> None:
+        """Adds another film of the same picture; that it used other iterations or another seed is up to you.
+
+        Raises:
+            InputError: The films differ in size.
+        """
+        if (self.width, self.height) != (other.width, other.height):
+            raise InputError(
+                f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels"
+            )
+        for name in FilmData.vars:
+            mine, theirs = getattr(self._data, name).numpy(), getattr(other._data, name).numpy()
+            if name != "mesh" or self.iterations == 0:
+                getattr(self._data, name).assign(mine + theirs)
+        self.iterations += other.iterations
+        self.seconds += other.seconds
+
+    def radiance(self) -> npt.NDArray[np.float32]:
+        """Mean radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top."""
+        return self._mean("direct", "indirect").astype(np.float32)
+
+    def standard_error(self) -> npt.NDArray[np.float32]:
+        """Standard error of the mean, float32 [height, width, 3], from the spread of the iterations.
+
+        Iterations are independent but for the stratified pixel jitter: on edges the true error is smaller.
+        Infinite with fewer than two iterations.
+        """
+        n = self.iterations
+        if n < 2:
+            return np.full((self.height, self.width, 3), np.inf, np.float32)
+        mean = self._mean("direct", "indirect")
+        variance = np.maximum(self._mean("squares") - mean * mean, 0.0)
+        return np.sqrt(variance / (n - 1)).astype(np.float32)
+
+    def error(self) -> float:
+        """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²), m the mean of L.
+
+        NaN with fewer than two iterations.
+        """
+        if self.iterations < 2:
+            return math.nan
+        mean = self.radiance().astype(np.float64)
+        scale = mean**2 + 0.01 * mean.mean() ** 2
+        squared = self.standard_error().astype(np.float64) ** 2
+        return float(np.sqrt(np.mean(np.divide(squared, scale, out=np.zeros_like(squared), where=scale > 0.0))))
+
+    def aov(self, name: str) -> Image:
+        """One of `AOV_NAMES`.
+
+        "direct" and "indirect" [h, w, 3] add up to the radiance. "albedo", "normal" (shading, unit), "position"
+        (world) [h, w, 3] and "depth" (along the view, scene units) [h, w] are means over the surface samples of the
+        pixel, 0 where there are none; "alpha" [h, w] is the covered share; "prim_id" int32 [h, w] the
+        index into `Scene.meshes` that the first iteration saw, -1 for the background.
+
+        Raises:
+            InputError: There is no such AOV.
+        """
+        shape = (self.height, self.width)
+        if name in ("direct", "indirect"):
+            return self._mean(name).astype(np.float32)
+        if name == "prim_id":
+            return self._data.mesh.numpy().reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
+        hits = self._data.hits.numpy().reshape(shape)
+        if name == "alpha":
+            return (hits / max(self.iterations, 1)).astype(np.float32)
+        if name not in AOV_NAMES:
+            raise InputError(f"aov: there is no {name!r}; there are {', '.join(AOV_NAMES)}")
+        total = getattr(self._data, name).numpy().astype(np.float64).reshape(*shape, -1)
+        seen = hits[..., None] > 0
+        mean = np.divide(total, hits[..., None], out=np.zeros_like(total), where=seen)
+        if name == "normal":
+            length = np.linalg.norm(mean, axis=-1, keepdims=True)
+            mean = np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
+        if name == "position" and self._frame is not None:
+            mean = np.where(seen, self._frame.to_world(mean), 0.0)
+        if name == "depth":
+            mean = mean[..., 0] / (self._frame.scale if self._frame is not None else 1.0)
+        return mean.astype(np.float32)
+
+    @property
+    def rejected(self) -> int:
+        """Samples that were not finite and count as black; 0 unless something is wrong."""
+        return int(self._data.rejected.numpy().sum())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the film, sums and all, as .npz: `load` gives it back bit for bit."""
+        arrays = {name: getattr(self._data, name).numpy() for name in FilmData.vars}
+        origin, scale = (self._frame.origin, self._frame.scale) if self._frame is not None else (np.zeros(3), 1.0)
+        size = np.array([self.width, self.height, self.iterations])
+        with open(path, "wb") as file:
+            np.savez(file, size=size, seconds=self.seconds, origin=origin, scale=scale, **arrays)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
+        """Reads a film that `save` wrote.
+
+        Raises:
+            InputError: The file is missing or is no film.
+        """
+        from warp_ir.device_scene import DeviceFrame
+
+        try:
+            with np.load(path) as file:
+                arrays = {name: file[name] for name in (*FilmData.vars, "size", "seconds", "origin", "scale")}
+        except (OSError, KeyError, ValueError) as error:
+            raise InputError(f"{os.fspath(path)}: not a film: {error}") from error
+        width, height, iterations = (int(x) for x in arrays["size"])
+        film = Film(width, height, Launcher(device), DeviceFrame(arrays["origin"], float(arrays["scale"])))
+        film.iterations, film.seconds = iterations, float(arrays["seconds"])
+        for name in FilmData.vars:
+            getattr(film._data, name).assign(arrays[name])
+        return film
+
+    def _mean(self, *names: str) -> npt.NDArray[np.float64]:
+        """The mean per iteration of the sum of some tables, float64 [height, width, 3]."""
+        total = np.sum([getattr(self._data, name).numpy() for name in names], axis=0)
+        return np.asarray(total / max(self.iterations, 1)).reshape(self.height, self.width, 3)

@@ -1,0 +1,114 @@
+"""How kernels run: on all CPU cores with the same bits whatever their number, or on a CUDA device.
+
+A Warp launch on the CPU is single-threaded but releases the GIL, so a launch is cut into bands of
+indices that Python threads take in turn. The convention that makes this possible: the first argument
+of every kernel of this package is ``first: int``, and its index is ``first + wp.tid()``. Kernels write
+only what their index owns, so the cut cannot be seen in the result.
+"""
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import warp as wp
+
+from warp_ir.profiling import Profile
+from warp_ir.scene import InputError
+
+_BANDS_PER_THREAD = 16
+_BLOCK_DIM = 64
+
+
+class Cancelled(Exception):
+    """The work in flight was abandoned because `Launcher.cancel` was called."""
+
+
+class Launcher:
+    """Runs kernels on one device, and measures them by phase."""
+
+    def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
+        """Opens the device.
+
+        Args:
+            device: "cpu", "cuda" or "cuda:N".
+            threads: CPU threads; by default one for each core this process may use.
+
+        Raises:
+            InputError: There is no such device.
+        """
+        try:
+            self.device = wp.get_device(device)
+        except (ValueError, RuntimeError) as error:
+            known = ", ".join(str(d) for d in wp.get_devices())
+            raise InputError(f"device {device!r} is not available; available: {known}") from error
+        self.profile = Profile(self.device)
+        self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
+        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._cancelled = threading.Event()
+
+    def load(self, modules: Sequence[Any]) -> None:
+        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules."""
+        with self.profile.phase("compile"):
+            for module in modules:
+                wp.load_module(module, device=self.device, block_dim=_BLOCK_DIM)
+
+    def launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
+        """Runs ``kernel(first, *inputs)`` for indices 0 to `count` - 1.
+
+        Raises:
+            Cancelled: `cancel` was called before all of it had run.
+        """
+        if self._cancelled.is_set():
+            raise Cancelled
+        if count <= 0:
+            return
+        if self.device.is_cuda:
+            self._run(kernel, 0, count, inputs)
+            return
+        bands = min(count, self.threads * _BANDS_PER_THREAD)
+        edges = [count * k // bands for k in range(bands + 1)]
+        spans = zip(edges[:-1], edges[1:], strict=True)
+        if self._pool is None or count < 256:
+            finished = [self._run(kernel, a, b, inputs) for a, b in spans]
+        else:
+            finished = list(self._pool.map(lambda span: self._run(kernel, *span, inputs), spans))
+        if not all(finished):
+            raise Cancelled
+
+    def _run(self, kernel: Any, begin: int, end: int, inputs: Sequence[Any]) -> bool:
+        """Runs one band, unless cancelled; whether it ran."""
+        if self._cancelled.is_set():
+            return False
+        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], device=self.device, block_dim=_BLOCK_DIM)
+        return True
+
+    def cancel(self) -> None:
+        """Abandons the launches in flight as soon as may be; safe from a signal handler or another thread."""
+        self._cancelled.set()
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Times what is launched inside under `name`."""
+        with self.profile.phase(name):
+            yield
+
+    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        """An uninitialised array on the device."""
+        return wp.empty(shape, dtype=dtype, device=self.device)
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        """An array of zeros on the device."""
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def array(self, data: Any, dtype: Any) -> Any:
+        """A copy of host data on the device."""
+        return wp.array(data, dtype=dtype, device=self.device)
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

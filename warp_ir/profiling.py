@@ -1,0 +1,52 @@
+"""Where the time goes: seconds by phase, on the host's clock or the GPU's own."""
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import warp as wp
+
+
+class Profile:
+    """Seconds and counts by name. On CUDA a phase is timed by events, so that nothing waits for it."""
+
+    def __init__(self, device: Any) -> None:
+        """A profile of work on a Warp device."""
+        self._device = device
+        self._seconds: dict[str, float] = defaultdict(float)
+        self._pending: list[tuple[str, Any, Any]] = []
+        self.counts: Counter[str] = Counter()
+        """How often things happened: rays, VPLs, ...; add to it freely."""
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Adds the time spent inside to `name`."""
+        if self._device.is_cuda:
+            begin, end = wp.Event(self._device, enable_timing=True), wp.Event(self._device, enable_timing=True)
+            wp.record_event(begin)
+            try:
+                yield
+            finally:
+                wp.record_event(end)
+                self._pending.append((name, begin, end))
+        else:
+            start = time.perf_counter()
+            try:
+                yield
+            finally:
+                self._seconds[name] += time.perf_counter() - start
+
+    def add(self, name: str, seconds: float) -> None:
+        """Adds time that was measured elsewhere."""
+        self._seconds[name] += seconds
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds so far, by phase. Waits for the GPU's pending work."""
+        if self._pending:
+            wp.synchronize_device(self._device)
+            for name, begin, end in self._pending:
+                self._seconds[name] += wp.get_event_elapsed_time(begin, end, synchronize=False) / 1000.0
+            self._pending.clear()
+        return dict(self._seconds)

@@ -1,0 +1,206 @@
+"""The algorithm on one page.
+
+    upload the scene
+    repeat, for iteration i = 0, 1, 2, ...
+        camera rays find what each pixel sees          -> GBuffer     gbuffer.py
+        light paths leave virtual point lights behind  -> VplBuffer   vpl.py
+        every pixel sums the light of the VPLs                        estimators/
+        the estimate is added                          -> Film        film.py
+    the picture is the mean
+
+Iteration i depends on (scene, camera, settings, i) and nothing else: a picture is the same bits on any
+number of threads, and two films of different iterations add up to a better one.
+"""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import warp as wp
+
+import warp_ir.estimators.keller
+import warp_ir.estimators.path
+import warp_ir.film
+import warp_ir.gbuffer
+import warp_ir.vpl
+from warp_ir.device_scene import camera_data, upload_scene
+from warp_ir.estimators import ESTIMATORS
+from warp_ir.film import Film
+from warp_ir.gbuffer import new_gbuffer
+from warp_ir.launch import Cancelled, Launcher
+from warp_ir.sampling import iteration_scramble
+from warp_ir.scene import Scene
+from warp_ir.settings import MAX_PIXELS, RenderSettings
+from warp_ir.vpl import Vpls, emit_vpls, to_host
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a render has come, as `render` tells its `progress` callback after every iteration."""
+
+    iterations: int
+    """Iterations done."""
+    seconds: float
+    """Seconds of rendering so far."""
+    error: float
+    """`Film.error` as last measured; NaN before two iterations."""
+    fraction: float
+    """Share of the nearest limit that is used up, 0 to 1."""
+    seconds_left: float
+    """Estimate of what remains [s]; NaN if unknown."""
+
+
+class Renderer:
+    """A scene on a device, ready to add iterations to films."""
+
+    def __init__(self, scene: Scene, settings: RenderSettings, *, device: str = "cpu", threads: int | None = None):
+        """Uploads the scene and compiles the kernels its estimator needs.
+
+        Args:
+            scene: What to render.
+            settings: How.
+            device: "cpu", "cuda" or "cuda:N".
+            threads: CPU threads; by default one per core. The picture does not depend on it.
+
+        Raises:
+            InputError: The scene, the settings or the device cannot be used.
+        """
+        height = settings.height or max(1, round(settings.width / scene.camera.aspect))
+        self.settings = replace(settings, height=height)  # checks the number of pixels again
+        self.launcher = Launcher(device, threads)
+        self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
+        self.scene = upload_scene(scene, self.launcher)
+        self._exposure = scene.camera.exposure
+        camera = camera_data(scene.camera, self.scene.frame, settings.width, height)
+        self._estimator = ESTIMATORS[settings.estimator](self.scene, camera, self.settings, self.launcher)
+        pixels = settings.width * height
+        self._gbuffer = new_gbuffer(self.launcher, pixels)
+        self._direct = self.launcher.empty(pixels, wp.vec3)
+        self._indirect = self.launcher.empty(pixels, wp.vec3)
+
+    def new_film(self) -> Film:
+        """An empty film of the right size."""
+        assert self.settings.height is not None
+        film = Film(self.settings.width, self.settings.height, self.launcher, self.scene.frame)
+        film.settings = self.settings
+        return film
+
+    def add_iteration(self, film: Film, iteration: int) -> None:
+        """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
+        self._estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
+        with self.launcher.phase("film"):
+            film.add(self._gbuffer, self._direct, self._indirect, self._exposure)
+        wp.synchronize_device(self.launcher.device)
+
+
+def render(
+    scene: Scene,
+    settings: RenderSettings | None = None,
+    *,
+    device: str = "cpu",
+    progress: Callable[[Progress], None] | None = None,
+) -> Film:
+    """Renders a scene until one of the settings' limits is reached.
+
+    SIGINT (Ctrl-C) and SIGTERM end it early: the film holds the iterations done so far and says `interrupted`.
+
+    Args:
+        scene: What to render, from `load_usd` or made by hand.
+        settings: How; the defaults if None.
+        device: "cpu", "cuda" or "cuda:N".
+        progress: Called after every iteration.
+
+    Raises:
+        InputError: The scene, the settings or the device cannot be used; the message says why in one line.
+    """
+    renderer = Renderer(scene, settings or RenderSettings(), device=device)
+    settings = renderer.settings
+    film = renderer.new_film()
+    with _signals_cancel(renderer.launcher, film):
+        start = time.perf_counter()
+        checked, error = 0, math.nan
+        while not film.interrupted:
+            try:
+                renderer.add_iteration(film, film.iterations)
+            except Cancelled:
+                break
+            film.seconds = time.perf_counter() - start
+            # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
+            if film.iterations >= max(2, checked + checked // 8 + 1):
+                checked, error = film.iterations, film.error()
+            report = _progress(film, settings, error)
+            if progress is not None:
+                progress(report)
+            if report.fraction >= 1.0:
+                break
+    film.timings = renderer.launcher.profile.seconds()
+    film.counts = {"iterations": film.iterations, **renderer.launcher.profile.counts}
+    return film
+
+
+def trace_vpls(scene: Scene, settings: RenderSettings | None = None, *, device: str = "cpu", iteration: int = 0) -> Vpls:
+    """The VPLs of one iteration, in world space.
+
+    Args:
+        scene: Where to trace; empty arrays come back if nothing in it emits.
+        settings: `light_paths`, `absorption`, `max_bounces` and `seed` count.
+        device: Where to trace them.
+        iteration: Which iteration's VPLs.
+    """
+    settings = settings or RenderSettings()
+    launcher = Launcher(device)
+    uploaded = upload_scene(scene, launcher)
+    vpls = emit_vpls(
+        uploaded,
+        launcher,
+        paths=settings.light_paths,
+        absorption=settings.absorption or "fractional",
+        max_bounces=settings.max_bounces,
+        scramble=iteration_scramble(settings.seed, iteration),
+    )
+    return to_host(vpls, uploaded)
+
+
+def _modules(estimator: str) -> list[Any]:
+    if estimator == "keller":
+        return [warp_ir.vpl, warp_ir.estimators.keller]
+    return [warp_ir.estimators.path]
+
+
+def _progress(film: Film, settings: RenderSettings, error: float) -> Progress:
+    """What is used up of each limit; the largest share counts."""
+    shares = [film.iterations / settings.iteration_limit]
+    if settings.time_limit is not None:
+        # An iteration that would end beyond the limit is not begun.
+        shares.append(film.seconds * (film.iterations + 1) / film.iterations / settings.time_limit)
+    if settings.target_error is not None and error > 0.0:
+        shares.append((settings.target_error / error) ** 2)
+    elif settings.target_error is not None and error == 0.0:
+        shares.append(1.0)
+    fraction = min(max(shares), 1.0)
+    left = film.seconds * (1.0 / fraction - 1.0) if fraction > 0.0 else math.nan
+    return Progress(film.iterations, film.seconds, error, fraction, left)
+
+
+@contextmanager
+def _signals_cancel(launcher: Launcher, film: Film) -> Iterator[None]:
+    """Makes SIGINT and SIGTERM stop the work in flight and mark the film, where Python allows it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _: Any) -> None:
+        film.interrupted = True
+        launcher.cancel()
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,108 @@
+"""Rays against surfaces: the only ray queries, and the only epsilon, of the whole renderer.
+
+Intersection points come from barycentric coordinates, which keeps their error within a few ulp of the
+triangle's own coordinates however far the ray has come (Wächter and Binder 2019). A ray therefore starts
+8 ulp off the surface, on the side it leaves from: farther than the error, nearer than any detail
+a float can hold, at any scale.
+"""
+
+import warp as wp
+
+from warp_ir.device_scene import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+_EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
+_INFINITY = wp.constant(3.0e38)
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets a surface; `triangle` is -1 if it does not."""
+
+    triangle: int
+    t: float  # in units of the ray's direction
+    u: float  # weights of the triangle's first and second corner
+    v: float
+    position: wp.vec3  # off the surface, on the side of `normal`: where rays may start
+    normal: wp.vec3  # unit geometric normal, on the side the ray came from
+    front: int  # 1 if that is the side from which the triangle is wound counter-clockwise
+
+
+@wp.func
+def offset(scene: SceneData, triangle: int, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+    """A point of a triangle moved off it, to the side of `normal`, by more than its rounding error."""
+    a = scene.points[scene.indices[3 * triangle]]
+    b = scene.points[scene.indices[3 * triangle + 1]]
+    c = scene.points[scene.indices[3 * triangle + 2]]
+    size = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
+    return point + normal * (size * _EIGHT_ULP)
+
+
+@wp.func
+def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest surface along a ray."""
+    hit = Hit()
+    hit.triangle = -1
+    query = wp.mesh_query_ray(scene.mesh, origin, direction, t_max)
+    if query.result:
+        face = query.face
+        hit.triangle = face
+        hit.t = query.t
+        hit.u = query.u
+        hit.v = query.v
+        hit.front = wp.where(wp.dot(query.normal, direction) < 0.0, 1, 0)
+        hit.normal = wp.where(hit.front == 1, query.normal, -query.normal)
+        a = scene.points[scene.indices[3 * face]]
+        b = scene.points[scene.indices[3 * face + 1]]
+        c = scene.points[scene.indices[3 * face + 2]]
+        point = query.u * a + query.v * b + (1.0 - query.u - query.v) * c
+        hit.position = offset(scene, face, point, hit.normal)
+    return hit
+
+
+@wp.func
+def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
+    """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
+    xyz = wp.vec3(target[0], target[1], target[2])
+    if target[3] == 0.0:
+        return not wp.mesh_query_ray_anyhit(scene.mesh, origin, xyz, _INFINITY)
+    return not wp.mesh_query_ray_anyhit(scene.mesh, origin, xyz - origin, 0.999999)
+
+
+@wp.func
+def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
+    """The interpolated normal on the side of the geometric one; the geometric one where there is none."""
+    row = scene.triangle_normals[hit.triangle]
+    if row < 0:
+        return hit.normal
+    n = (
+        hit.u * scene.corner_normals[row]
+        + hit.v * scene.corner_normals[row + 1]
+        + (1.0 - hit.u - hit.v) * scene.corner_normals[row + 2]
+    )
+    length = wp.length(n)
+    if length < 1.0e-6:
+        return hit.normal
+    return wp.where(wp.dot(n, hit.normal) < 0.0, -n, n) / length
+
+
+@wp.func
+def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
+    """Hemispherical reflectance ρ at a hit."""
+    row = scene.triangle_colors[hit.triangle]
+    if row < 0:
+        return scene.albedo[scene.triangle_material[hit.triangle]]
+    return (
+        hit.u * scene.corner_colors[row]
+        + hit.v * scene.corner_colors[row + 1]
+        + (1.0 - hit.u - hit.v) * scene.corner_colors[row + 2]
+    )
+
+
+@wp.func
+def emission(scene: SceneData, hit: Hit) -> wp.vec3:
+    """Radiance [W sr⁻¹ m⁻²] that a surface emits towards the ray that hit it."""
+    if hit.front == 1 or scene.emits_back[hit.triangle] == 1:
+        return scene.emission[scene.triangle_material[hit.triangle]]
+    return wp.vec3(0.0)
