@@ -67,8 +67,11 @@ class SceneData:
 
 @wp.struct
 class CameraData:
-    """A camera in the scene's device frame."""
+    """A camera in the scene's device frame, and the image it fills."""
 
+    columns: int
+    rows: int
+    shows_lights: int  # 1: analytic lights are visible
     origin: wp.vec3
     right: wp.vec3
     up: wp.vec3
@@ -152,8 +155,8 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
         )
 
 
-def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int) -> Any:
-    """The `CameraData` of a camera fitted to an image.
+def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int, *, visible_lights: bool) -> Any:
+    """The `CameraData` of a camera fitted to an image of `width` x `height` pixels.
 
     Raises:
         InputError: The window is empty, or something is not finite.
@@ -166,6 +169,7 @@ def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int) -> 
         raise InputError(f"camera {camera.name!r}: the window is empty")
     unit = 1.0 if camera.projection == Projection.PERSPECTIVE else frame.scale
     out = CameraData()
+    out.columns, out.rows, out.shows_lights = width, height, int(visible_lights)
     out.origin = wp.vec3(*frame.to_device(camera.world_from_camera[:3, 3]))
     out.right, out.up, out.back = (wp.vec3(*camera.world_from_camera[:3, k]) for k in range(3))
     out.left, out.bottom = left * unit, bottom * unit

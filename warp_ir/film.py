@@ -52,7 +52,7 @@ def _add(
     exposure: float,
     is_first: int,
     film: FilmData,
-):
+) -> None:
     """Adds one iteration's estimate of every pixel."""
     i = first + wp.tid()
     d = direct[i] * exposure
@@ -124,9 +124,7 @@ class Film:
             InputError: The films differ in size.
         """
         if (self.width, self.height) != (other.width, other.height):
-            raise InputError(
-                f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels"
-            )
+            raise InputError(f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels")
         for name in FilmData.vars:
             mine, theirs = getattr(self._data, name).numpy(), getattr(other._data, name).numpy()
             if name != "mesh" or self.iterations == 0:

@@ -12,7 +12,6 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.lights import lights_along
-from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest, emission, shading_normal
 
 wp.set_module_options({"enable_backward": False})
@@ -62,19 +61,16 @@ def _trace_primary(
     first: int,
     scene: SceneData,
     camera: CameraData,
-    width: int,
-    height: int,
     iteration: int,
     seed: wp.uint32,
-    visible_lights: int,
     gbuffer: GBuffer,
-):
+) -> None:
     """One camera ray and what it meets."""
     pixel = first + wp.tid()
     scramble = sampling.hash_combine(sampling.hash_combine(seed, wp.uint32(pixel)), _JITTER)
     jitter = sampling.sample_2d(scene.sobol, iteration, 0, scramble)
-    x = (float(pixel % width) + jitter[0]) / float(width)
-    y = (float(pixel // width) + jitter[1]) / float(height)
+    x = (float(pixel % camera.columns) + jitter[0]) / float(camera.columns)
+    y = (float(pixel // camera.columns) + jitter[1]) / float(camera.rows)
     ray = camera_ray(camera, x, y)
     origin = ray.origin + ray.direction * camera.near
     reach = camera.far - camera.near
@@ -91,11 +87,9 @@ def _trace_primary(
         gbuffer.depth[pixel] = hit.t + camera.near
         emitted = emission(scene, hit)
         reach = hit.t
-    if visible_lights == 1:
+    if camera.shows_lights == 1:
         length = wp.length(ray.direction)
-        emitted += lights_along(
-            scene, origin, ray.direction / length, reach * length, hit.triangle < 0, -1.0
-        )
+        emitted += lights_along(scene, origin, ray.direction / length, reach * length, hit.triangle < 0, -1.0)
     gbuffer.emission[pixel] = emitted
 
 
@@ -115,15 +109,10 @@ def trace_primary(
     launcher: Launcher,
     gbuffer: Any,
     *,
-    settings: RenderSettings,
     iteration: int,
+    seed: int,
 ) -> None:
     """Fills the G-buffer with what the camera sees in one iteration."""
-    width, height = settings.width, gbuffer.mesh.shape[0] // settings.width
-    seed = wp.uint32(settings.seed)
-    launcher.launch(
-        _trace_primary,
-        width * height,
-        [scene.data, camera, width, height, iteration, seed, int(settings.visible_lights), gbuffer],
-    )
-    launcher.profile.counts["primary_rays"] += width * height
+    pixels = camera.columns * camera.rows
+    launcher.launch(_trace_primary, pixels, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
+    launcher.profile.counts["primary_rays"] += pixels

@@ -128,7 +128,7 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
     pixels = reader.read_image(oiio.FLOAT) if reader else None
-    if pixels is None:
+    if reader is None or pixels is None:
         raise InputError(f"{path}: {_first_line(reader.geterror() if reader else oiio.geterror())}")
     names = list(reader.spec().channelnames)
     reader.close()
@@ -298,11 +298,14 @@ def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> A
         return tone_map(values, exposure, tonemap)
     if aov == "albedo":
         return srgb_from_linear(values)
+    low, high = 0.0, 1.0
     if aov == "normal":
-        return np.clip(0.5 * values + 0.5, 0.0, 1.0)
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size and aov != "alpha" else (0.0, 1.0)
-    return np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-30), 0.0, 1.0)
+        low = -1.0
+    elif aov != "alpha":
+        finite = values[np.isfinite(values)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (low, high)
+    shown: Array = np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-30), 0.0, 1.0)
+    return shown
 
 
 def _save(path: Path, spec: Any, pixels: npt.NDArray[Any]) -> None:
@@ -313,7 +316,7 @@ def _save(path: Path, spec: Any, pixels: npt.NDArray[Any]) -> None:
         # libjpeg ends the process when it cannot write.
         raise InputError(f"{path}: cannot be written: no space left on the device")
     with whole_file(path) as temporary:
-        writer = oiio.ImageOutput.create(str(temporary))
+        writer: Any = oiio.ImageOutput.create(str(temporary))
         # All three are called: close() flushes, and geterror() knows of failures that they do not report.
         good = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
         good = writer.close() and good

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import warp as wp
@@ -70,11 +71,11 @@ class Launcher:
             return
         bands = min(count, self.threads * _BANDS_PER_THREAD)
         edges = [count * k // bands for k in range(bands + 1)]
-        spans = zip(edges[:-1], edges[1:], strict=True)
+        spans = pairwise(edges)
         if self._pool is None or count < 256:
             finished = [self._run(kernel, a, b, inputs) for a, b in spans]
         else:
-            finished = list(self._pool.map(lambda span: self._run(kernel, *span, inputs), spans))
+            finished = list(self._pool.map(lambda span: self._run(kernel, span[0], span[1], inputs), spans))
         if not all(finished):
             raise Cancelled
 

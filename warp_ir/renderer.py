@@ -35,7 +35,7 @@ from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
 from warp_ir.sampling import iteration_scramble
 from warp_ir.scene import Scene
-from warp_ir.settings import MAX_PIXELS, RenderSettings
+from warp_ir.settings import RenderSettings
 from warp_ir.vpl import Vpls, emit_vpls, to_host
 
 
@@ -76,7 +76,9 @@ class Renderer:
         self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
         self.scene = upload_scene(scene, self.launcher)
         self._exposure = scene.camera.exposure
-        camera = camera_data(scene.camera, self.scene.frame, settings.width, height)
+        camera = camera_data(
+            scene.camera, self.scene.frame, settings.width, height, visible_lights=settings.visible_lights
+        )
         self._estimator = ESTIMATORS[settings.estimator](self.scene, camera, self.settings, self.launcher)
         pixels = settings.width * height
         self._gbuffer = new_gbuffer(self.launcher, pixels)
@@ -143,7 +145,9 @@ def render(
     return film
 
 
-def trace_vpls(scene: Scene, settings: RenderSettings | None = None, *, device: str = "cpu", iteration: int = 0) -> Vpls:
+def trace_vpls(
+    scene: Scene, settings: RenderSettings | None = None, *, device: str = "cpu", iteration: int = 0
+) -> Vpls:
     """The VPLs of one iteration, in world space.
 
     Args:

@@ -121,9 +121,7 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
 @wp.func
 def sample_2d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> wp.vec2:
     """Coordinates `dimension` and `dimension` + 1 of a point, in [0, 1)²."""
-    return wp.vec2(
-        sample_1d(matrices, index, dimension, scramble), sample_1d(matrices, index, dimension + 1, scramble)
-    )
+    return wp.vec2(sample_1d(matrices, index, dimension, scramble), sample_1d(matrices, index, dimension + 1, scramble))
 
 
 @wp.func

@@ -58,9 +58,7 @@ class RenderSettings:
             self._check(name, getattr(self, name) is None or _positive(getattr(self, name)), "a positive number")
         self._check("bound_radius", self.bound_radius == 0 or _positive(self.bound_radius), "a number of at least 0")
         self._check("estimator", self.estimator in ESTIMATOR_NAMES, f"one of {', '.join(ESTIMATOR_NAMES)}")
-        self._check(
-            "absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}"
-        )
+        self._check("absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}")
         self._check(
             "width", self.width * (self.height or 1) <= MAX_PIXELS, f"small enough: at most {MAX_PIXELS} pixels in all"
         )

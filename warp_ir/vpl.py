@@ -66,7 +66,7 @@ def _trace_paths(
     store: int,
     vpls: VplBuffer,
     lengths: wp.array[wp.int32],
-):
+) -> None:
     """Follows path `i`; counts its vertices, or stores them from row offsets[i] on."""
     i = first + wp.tid()
     slot = int(0)

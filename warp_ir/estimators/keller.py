@@ -57,7 +57,7 @@ def _accumulate(
     bound: float,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
-):
+) -> None:
     """L = Le + ρ/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others."""
     pixel = first + wp.tid()
     from_lights = wp.vec3(0.0)
@@ -94,7 +94,7 @@ class Keller:
         """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, settings=settings, iteration=iteration)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
         with launcher.phase("emission"):
             vpls = emit_vpls(
                 self._scene,

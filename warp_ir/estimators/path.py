@@ -59,7 +59,7 @@ def _trace_paths(
     max_bounces: int,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
-):
+) -> None:
     """Follows one path from what the camera sees at a pixel."""
     pixel = first + wp.tid()
     once = gbuffer.emission[pixel]
@@ -123,7 +123,7 @@ class PathTracer:
         """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, settings=settings, iteration=iteration)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
         with launcher.phase("gather"):
             launcher.launch(
                 _trace_paths,

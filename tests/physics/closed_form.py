@@ -1,0 +1,82 @@
+"""Irradiance by quadrature, and the checks that compare a picture with a number."""
+
+import math
+
+import numpy as np
+
+import warp_ir as ir
+from warp_ir.scene import LightKind
+
+
+def assert_mean(film, expected, *, bias=0.0, sigmas=5.0):
+    """The picture's mean is `expected` within its own standard error.
+
+    The mean over pixels has at most the mean of their standard errors (all correlated, as VPLs are). `sigmas` = 5
+    at 16 or more iterations is a false alarm in 10⁴ (Student's t); 1e-5 covers float32. `bias` is the part, relative,
+    that the estimator is known to leave out.
+    """
+    mean = float(film.radiance().astype(np.float64).mean())
+    allowed = sigmas * float(film.standard_error().mean()) + (1.0e-5 + bias) * abs(expected)
+    assert abs(mean - expected) <= allowed, f"mean {mean:.6g}, expected {expected:.6g} ± {allowed:.2g}"
+
+
+def unit_shape(kind, u, v):
+    """Points [..., 3] of a light's unit shape at parameters in [0, 1]²."""
+    if kind == LightKind.RECT:
+        return np.stack([u - 0.5, v - 0.5, 0 * u], axis=-1)
+    if kind == LightKind.DISK:
+        r, phi = u, 2 * np.pi * v
+        return np.stack([r * np.cos(phi), r * np.sin(phi), 0 * u], axis=-1)
+    if kind == LightKind.SPHERE:
+        theta, phi = np.pi * u, 2 * np.pi * v
+        return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    phi = 2 * np.pi * v
+    return np.stack([u - 0.5, np.cos(phi), np.sin(phi)], axis=-1)
+
+
+def irradiance_at_origin(light: ir.Light, n: int = 600) -> float:
+    """E on the plane y = 0 at the origin: ∫ L cosθ cosθ' / d² dA over the light by the midpoint rule.
+
+    Written from the definition and independent of the renderer: areas and normals come from differences.
+    """
+    size = {
+        LightKind.RECT: (light.width, light.height, 1.0),
+        LightKind.DISK: (light.radius, light.radius, 1.0),
+        LightKind.SPHERE: (light.radius,) * 3,
+        LightKind.CYLINDER: (light.length, light.radius, light.radius),
+    }[light.kind]
+    matrix = light.world_from_light[:3, :3] * np.array(size)
+
+    def place(u, v):
+        return unit_shape(light.kind, u, v) @ matrix.T + light.world_from_light[:3, 3]
+
+    h = 1.0e-4
+    u, v = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n, indexing="ij")
+    du = (place(u + h, v) - place(u - h, v)) / (2 * h)
+    dv = (place(u, v + h) - place(u, v - h)) / (2 * h)
+    area_normal = np.cross(du, dv) / n**2
+    p = place(u, v)
+    if light.kind in (LightKind.RECT, LightKind.DISK):  # along the light's -Z, whatever the handedness
+        side = np.linalg.inv(light.world_from_light[:3, :3]).T @ np.array([0.0, 0.0, -1.0])
+        area_normal = area_normal * np.sign(area_normal @ side)[..., None]
+    else:
+        centre = light.world_from_light[:3, 3]
+        area_normal = area_normal * np.sign(np.sum(area_normal * (p - centre), axis=-1))[..., None]
+    d2 = np.sum(p * p, axis=-1)
+    d = np.sqrt(d2)
+    cos_floor = np.maximum(p[..., 1] / d, 0.0)
+    cos_light_area = np.maximum(np.sum(-p * area_normal, axis=-1) / d, 0.0)
+    return float(light.radiance[0] * np.sum(cos_floor * cos_light_area / d2))
+
+
+def rotation_x(degrees: float) -> np.ndarray:
+    """A rotation about X as a 3x3 matrix on column vectors."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def placed(linear: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+    """A 4x4 matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, origin
+    return matrix

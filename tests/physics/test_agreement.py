@@ -1,0 +1,111 @@
+"""The estimators agree with each other, converge as they should, and know how wrong they are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import warp_ir as ir
+from tests.physics.closed_form import placed, rotation_x
+from tests.physics.test_invariance import room
+from warp_ir.estimators import ESTIMATORS
+from warp_ir.procedural import cornell_box, floor, furnace, mesh, sphere
+from warp_ir.scene import LightKind
+
+
+def render(scene, estimator, **settings):
+    return ir.render(scene, ir.RenderSettings(estimator=estimator, **settings))
+
+
+def smooth_ball():
+    """A smooth-shaded ball in the Cornell box: interpolated normals, and colours by corner."""
+    points, triangles = sphere(100.0, level=2)
+    normals = (points / 100.0)[triangles].astype(np.float32)
+    ball = mesh("ball", points + [278, 250, 150], triangles)
+    ball = dataclasses.replace(ball, normals=normals, colors=np.abs(normals))
+    scene = cornell_box()
+    return dataclasses.replace(scene, meshes=(*scene.meshes, ball))
+
+
+@pytest.mark.parametrize("make", [cornell_box, room, smooth_ball])
+@pytest.mark.parametrize("absorption", ["fractional", "roulette"])
+def test_keller_agrees_with_path(make, absorption):
+    """Per pixel the difference of two estimates over its standard error is a standard normal; so is the mean's.
+
+    Of 432 values at most 0.1 % may exceed 4.5 (Student's t at 24 iterations), and the shift of the mean,
+    whose standard error is at most the mean of the VPLs' (they are correlated), stays within 4 of those.
+    """
+    common = dict(width=12, height=12)
+    one = render(make(), "keller", iterations=24, light_paths=256, absorption=absorption, **common)
+    two = render(make(), "path", iterations=1024, **common)
+    error = np.hypot(one.standard_error(), two.standard_error())
+    z = (one.radiance() - two.radiance()) / np.maximum(error, 1e-12)
+    assert (np.abs(z) > 4.5).mean() <= 0.001
+    shift = float(one.radiance().mean() - two.radiance().mean())
+    assert abs(shift) < 4.0 * float(one.standard_error().mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [cornell_box, smooth_ball])
+def test_means_agree_at_convergence(make):
+    """Mean radiance of keller and path within 0.5 %."""
+    one = render(make(), "keller", iterations=128, light_paths=1024, width=24, height=24)
+    two = render(make(), "path", iterations=8192, width=24, height=24)
+    assert one.radiance().mean() == pytest.approx(two.radiance().mean(), rel=0.005)
+
+
+def repeated(estimator, iterations, *, light_paths=64, seeds=16):
+    """Images and standard errors [seeds, h, w, 3] of a room without edges, rendered again and again.
+
+    Without edges because there the stratified jitter makes the true error smaller; and with G bounded, since next to
+    another wall its square has no finite mean and no statement about errors can hold.
+    """
+    common = dict(
+        width=8, height=8, light_paths=light_paths, absorption="roulette", bound_radius=0.3, max_bounces=max_bounces
+    )
+    scene = furnace(0.6, shape="cube")
+    films = [render(scene, estimator, iterations=iterations, seed=seed, **common) for seed in range(seeds)]
+    return np.array([f.radiance() for f in films], np.float64), np.array([f.standard_error() for f in films])
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_standard_error_is_honest(estimator):
+    """Repeated renders scatter as their standard errors say: the Z scores against their common mean have variance 1.
+
+    32 renders of 64 pixels, whose errors within a render may be as good as the same, leave that uncertain by
+    √(2/32) = 1/4 at worst; two of those.
+    """
+    images, errors = repeated(estimator, 128 if estimator == "path" else 48, seeds=32)
+    z = (images - images.mean(axis=0)) / (errors * np.sqrt(31 / 32))
+    assert 0.5 < (z**2).mean() < 1.5
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_error_falls_as_one_over_root_n(estimator):
+    """The log-log slope of the spread over the number of (independent) iterations is -1/2.
+
+    Each spread is of 16 renders, known to 1/√32 or ±18 % at worst; over a factor of 16 the slope is then known to ±0.09.
+    """
+    counts = [4, 16, 64]
+    spreads = [repeated(estimator, n)[0].std(axis=0, ddof=1).mean() for n in counts]
+    slope = stats.linregress(np.log(counts), np.log(spreads)).slope
+    assert -0.68 < slope < -0.32
+
+
+def test_light_paths_are_of_low_discrepancy():
+    """Eight times the points on a rectangular light leave not 1/8 of the variance, as random ones, but 1/64 or less.
+
+    For a smooth integrand scrambled nets promise N⁻³ (Owen 1997), that is 1/512.
+    """
+    lamp = ir.Light("lamp", LightKind.RECT, (1.0,) * 3, placed(rotation_x(-90.0), (0.3, 1.0, 0.1)))
+    few, many = (
+        np.var(
+            [
+                render(floor(lamp), "keller", width=1, height=1, iterations=1, light_paths=n, seed=seed).radiance()
+                for seed in range(16)
+            ]
+        )
+        for n in (64, 512)
+    )
+    assert many < few / 64

@@ -1,0 +1,157 @@
+"""What must not change the picture, and what must change it by a known factor. These find most bugs."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+from warp_ir.estimators import ESTIMATORS
+from warp_ir.procedural import cornell_box, mesh
+from warp_ir.renderer import Renderer
+from warp_ir.scene import LightKind
+
+pytestmark = pytest.mark.parametrize("estimator", ESTIMATORS)
+
+
+def render(scene, estimator, device="cpu", **settings):
+    defaults = dict(width=24, height=24, iterations=2, light_paths=64)
+    return ir.render(scene, ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
+
+
+def room():
+    """A Cornell box with an analytic light of each kind beside its emissive surface."""
+    scene = cornell_box()
+    lights = []
+    for k, kind in enumerate(LightKind):
+        matrix = np.eye(4)
+        matrix[:3, 3] = (100.0 + 50.0 * k, 400.0, 250.0)
+        strength = 1.0e4 if kind == LightKind.POINT else 0.3
+        lights.append(ir.Light(kind.name, kind, (strength,) * 3, matrix, 40.0, 30.0, 15.0, 40.0, 30.0))
+    return dataclasses.replace(scene, lights=tuple(lights))
+
+
+def transformed(scene, linear, shift):
+    """The scene and its camera under x -> linear x + shift, linear being a rotation times a scale."""
+    scale = np.cbrt(np.linalg.det(linear))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    camera = matrix @ scene.camera.world_from_camera
+    camera[:3, :3] /= scale
+    lights = [
+        dataclasses.replace(
+            light,
+            world_from_light=matrix @ light.world_from_light,
+            radiance=tuple(x * (scale**2 if light.kind == LightKind.POINT else 1.0) for x in light.radiance),
+        )
+        for light in scene.lights
+    ]
+    return dataclasses.replace(
+        scene,
+        meshes=tuple(dataclasses.replace(m, points=m.points @ linear.T + shift) for m in scene.meshes),
+        lights=tuple(lights),
+        camera=dataclasses.replace(scene.camera, world_from_camera=camera),
+    )
+
+
+def test_twice_the_light_is_twice_the_film(estimator, device):
+    """Doubling every emission doubles every pixel, bit for bit."""
+    scene = room()
+    brighter = dataclasses.replace(
+        scene,
+        materials=tuple(dataclasses.replace(m, emission=tuple(2 * e for e in m.emission)) for m in scene.materials),
+        lights=tuple(dataclasses.replace(x, radiance=tuple(2 * e for e in x.radiance)) for x in scene.lights),
+    )
+    np.testing.assert_array_equal(
+        render(brighter, estimator, device).radiance(), 2.0 * render(scene, estimator, device).radiance()
+    )
+
+
+def test_exposure_scales_the_film(estimator, device):
+    """A camera exposure of 4 gives four times the film, bit for bit."""
+    scene = room()
+    brighter = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, exposure=4.0))
+    np.testing.assert_array_equal(
+        render(brighter, estimator, device).radiance(), 4.0 * render(scene, estimator, device).radiance()
+    )
+
+
+@pytest.mark.parametrize("exponent", [-20, -3, 1, 20])
+def test_powers_of_two_of_scale_change_nothing(estimator, exponent, device):
+    """A scene 2^k times as large is the same picture, bit for bit."""
+    scaled = transformed(room(), np.eye(3) * 2.0**exponent, np.zeros(3))
+    np.testing.assert_array_equal(
+        render(scaled, estimator, device).radiance(), render(room(), estimator, device).radiance()
+    )
+
+
+@pytest.mark.parametrize("scale, shift", [(1.0e-4, 0.0), (1.0e6, 0.0), (1.0, 1.0e5 * 1000.0), (0.01, 3.0)])
+def test_scale_and_position_change_only_rounding(estimator, scale, shift, device):
+    """Scaled by 1e-4 to 1e6 or moved by 1e5 of its size, a scene is the same picture up to rounding.
+
+    Rounding can decide a ray at an edge the other way: allow that for 1 % of the pixels.
+    """
+    moved = transformed(room(), np.eye(3) * scale, np.full(3, shift))
+    here, there = render(room(), estimator, device).radiance(), render(moved, estimator, device).radiance()
+    different = np.abs(here - there).max(axis=2) > 2e-3 * here.mean()
+    assert different.mean() <= 0.01
+
+
+def test_order_of_meshes_and_materials_changes_nothing(estimator, device):
+    """Permuting meshes (with their materials' rows) changes nothing beyond the rounding of sums."""
+    scene = cornell_box()
+    order = [2, 0, 3, 1]
+    meshes = [dataclasses.replace(m, material=np.argsort(order)[m.material].astype(np.int32)) for m in scene.meshes]
+    shuffled = dataclasses.replace(
+        scene, meshes=tuple(reversed(meshes)), materials=tuple(scene.materials[k] for k in order)
+    )
+    # The two triangles of the light stay in order within their mesh, so the light paths are the same.
+    here, there = render(scene, estimator, device).radiance(), render(shuffled, estimator, device).radiance()
+    different = np.abs(here - there).max(axis=2) > 1e-4 * here.mean()
+    assert different.mean() <= 0.01
+
+
+def test_splitting_triangles_changes_nothing(estimator, device):
+    """A wall of many triangles is the same wall."""
+    scene = cornell_box()
+    floor = scene.meshes[0]
+    centre = floor.points.mean(axis=0)
+    fan = mesh(floor.name, [*floor.points, centre], [[k, (k + 1) % 4, 4] for k in range(4)])
+    split = dataclasses.replace(scene, meshes=(fan, *scene.meshes[1:]))
+    here, there = render(scene, estimator, device).radiance(), render(split, estimator, device).radiance()
+    different = np.abs(here - there).max(axis=2) > 1e-3 * here.mean()
+    assert different.mean() <= 0.01
+
+
+def test_rotation_changes_only_the_noise(estimator, device):
+    """A rotated scene seen by a rotated camera has the same mean radiance within the standard errors."""
+    angle = np.radians(37.0)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    films = [
+        render(scene, estimator, device, iterations=32 if estimator == "keller" else 256, width=12, height=12)
+        for scene in (room(), transformed(room(), turn, np.array([5.0, -3.0, 100.0])))
+    ]
+    means = [float(f.radiance().mean()) for f in films]
+    slack = 4.0 * np.hypot(*(float(f.standard_error().mean()) for f in films))
+    assert abs(means[0] - means[1]) < slack
+
+
+def test_threads_change_nothing(estimator):
+    """One, two and five threads give the same bits."""
+    images = []
+    for threads in (1, 2, 5):
+        settings = ir.RenderSettings(width=24, height=24, estimator=estimator, light_paths=64)
+        renderer = Renderer(room(), settings, threads=threads)
+        film = renderer.new_film()
+        renderer.add_iteration(film, 0)
+        images.append(film.radiance())
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[2])
+
+
+def test_seeds(estimator, device):
+    """The same seed gives the same bits, another one another picture."""
+    first, again = render(room(), estimator, device), render(room(), estimator, device)
+    np.testing.assert_array_equal(first.radiance(), again.radiance())
+    assert not np.array_equal(first.radiance(), render(room(), estimator, device, seed=1).radiance())

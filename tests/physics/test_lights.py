@@ -1,0 +1,112 @@
+"""Every light over a white floor, against its irradiance in closed form or by quadrature."""
+
+import math
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, rotation_x
+from warp_ir.estimators import ESTIMATORS
+from warp_ir.procedural import floor
+from warp_ir.scene import LightKind
+
+DOWN = rotation_x(-90.0)  # takes the light's -Z to the world's -Y
+STRETCH = np.diag([2.0, 1.0, 0.5])
+SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
+
+
+def render(light, estimator, device, **settings):
+    defaults = dict(width=8, height=8, iterations=16 if estimator == "keller" else 256, max_bounces=0)
+    return ir.render(floor(light), ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
+
+
+def light(kind, linear, **dimensions):
+    return ir.Light("light", kind, (3.0,) * 3, placed(linear, (0.3, 2.0, 0.1)), **dimensions)
+
+
+SHAPES = [
+    light(LightKind.RECT, DOWN, width=1.5, height=0.8),
+    light(LightKind.RECT, DOWN @ SHEAR, width=1.5, height=0.8),
+    light(LightKind.RECT, DOWN @ np.diag([-1.0, 1.0, 1.0]), width=1.5, height=0.8),
+    light(LightKind.DISK, DOWN, radius=0.7),
+    light(LightKind.DISK, DOWN @ STRETCH, radius=0.7),
+    light(LightKind.SPHERE, np.eye(3), radius=0.6),
+    light(LightKind.SPHERE, rotation_x(30.0) @ STRETCH, radius=0.6),
+    light(LightKind.SPHERE, SHEAR @ np.diag([1.0, -1.0, 1.0]), radius=0.6),
+    light(LightKind.CYLINDER, np.eye(3), length=2.0, radius=0.3),
+    light(LightKind.CYLINDER, SHEAR @ STRETCH, length=1.0, radius=0.4),
+]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.kind.name)
+def test_shapes_with_an_area(shape, estimator, device):
+    """L = E/π under rectangles, ellipses, ellipsoids and elliptic cylinders, scaled, sheared and mirrored."""
+    assert_mean(render(shape, estimator, device), irradiance_at_origin(shape) / math.pi, bias=1.0e-4)
+
+
+def test_quadrature_knows_the_textbook():
+    """The quadrature itself gives π L r²/(r²+h²) under a disk and π L r²/d² under a sphere."""
+    disk = ir.Light("d", LightKind.DISK, (1.0,) * 3, placed(DOWN, (0.0, 2.0, 0.0)), radius=0.7)
+    assert irradiance_at_origin(disk) == pytest.approx(math.pi * 0.49 / (0.49 + 4.0), rel=1e-4)
+    sphere = ir.Light("s", LightKind.SPHERE, (1.0,) * 3, placed(np.eye(3), (0.0, 2.0, 0.0)), radius=0.7)
+    assert irradiance_at_origin(sphere) == pytest.approx(math.pi * 0.49 / 4.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("angle", [0.0, 0.53, 60.0, 180.0])
+@pytest.mark.parametrize("tilt", [0.0, 50.0])
+def test_distant(estimator, angle, tilt, device):
+    """E = π sin²θ cos(tilt) L for a cone of half-angle θ above the horizon; E = cos(tilt) L for parallel light."""
+    sun = ir.Light("sun", LightKind.DISTANT, (2.0,) * 3, placed(rotation_x(-90.0 + tilt), (0, 0, 0)), angle=angle)
+    if angle + 2 * tilt > 180.0 and angle > 0.0:
+        pytest.skip("part of the cone is below the horizon")
+    solid = math.pi * math.sin(math.radians(angle / 2.0)) ** 2 if angle > 0.0 else 1.0
+    expected = 2.0 * solid * math.cos(math.radians(tilt)) / math.pi
+    assert_mean(render(sun, estimator, device), expected, bias=1.0e-4)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_dome(estimator, device):
+    """Under an open uniform sky of radiance L a white floor has radiance L."""
+    assert_mean(render(ir.Light("sky", LightKind.DOME, (0.7,) * 3), estimator, device), 0.7)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_point(estimator, device):
+    """E = I cosθ / d² under a point light."""
+    lamp = ir.Light("lamp", LightKind.POINT, (5.0,) * 3, placed(np.eye(3), (1.0, 2.0, 0.0)))
+    expected = 5.0 * (2.0 / math.sqrt(5.0)) / 5.0 / math.pi
+    assert_mean(render(lamp, estimator, device), expected, bias=1.0e-4)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_lights_emit_from_one_side(estimator, device):
+    """A rectangle or disk that faces away from the floor leaves it black."""
+    for kind in (LightKind.RECT, LightKind.DISK):
+        up = ir.Light("up", kind, (3.0,) * 3, placed(rotation_x(90.0), (0.0, 2.0, 0.0)))
+        np.testing.assert_array_equal(render(up, estimator, device).radiance(), 0.0)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_many_lights_add_up(estimator, device):
+    """All the lights together give the sum of what each gives."""
+    scene = floor(SHAPES[0])
+    scene = type(scene)(scene.meshes, scene.materials, tuple(SHAPES), scene.camera)
+    iterations = 16 if estimator == "keller" else 512
+    settings = ir.RenderSettings(width=8, height=8, iterations=iterations, estimator=estimator, max_bounces=0)
+    expected = sum(irradiance_at_origin(s) for s in SHAPES) / math.pi
+    assert_mean(ir.render(scene, settings, device=device), expected, bias=1.0e-4)
+
+
+def test_visible_lights_show_their_radiance(device):
+    """With visible_lights the camera sees a light's radiance from its emitting side, and nothing of it otherwise."""
+    towards = ir.Camera.look_at((0.0, 0.0, 0.0), (0.3, 2.0, 0.1), up=(1.0, 0.0, 0.0), fov=0.5)
+    for shape in SHAPES:
+        scene = ir.Scene(lights=(shape,), camera=towards)
+        seen = ir.render(scene, ir.RenderSettings(width=4, height=4, iterations=1, visible_lights=True), device=device)
+        np.testing.assert_allclose(seen.radiance(), 3.0, rtol=1e-6)
+        hidden = ir.render(scene, ir.RenderSettings(width=4, height=4, iterations=1), device=device)
+        np.testing.assert_array_equal(hidden.radiance(), 0.0)
+        np.testing.assert_array_equal(hidden.aov("alpha"), 0.0)

@@ -1,0 +1,88 @@
+"""Films add, and say how sure they are."""
+
+import math
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+from warp_ir.procedural import cornell_box, furnace
+from warp_ir.renderer import Renderer
+
+SETTINGS = ir.RenderSettings(width=12, height=8, light_paths=32, iterations=6)
+
+
+def test_half_and_half_is_the_whole(device):
+    """Iterations 0-2 and 3-5 in two films, merged, are iterations 0-5 in one."""
+    renderer = Renderer(cornell_box(), SETTINGS, device=device)
+    whole, one, two = (renderer.new_film() for _ in range(3))
+    for i in range(6):
+        renderer.add_iteration(whole, i)
+        renderer.add_iteration(one if i < 3 else two, i)
+    one.merge(two)
+    assert one.iterations == 6
+    np.testing.assert_allclose(one.radiance(), whole.radiance(), rtol=1e-6)
+    np.testing.assert_allclose(one.standard_error(), whole.standard_error(), rtol=1e-4, atol=1e-9)
+    for name in ir.Film.AOV_NAMES:
+        np.testing.assert_allclose(one.aov(name), whole.aov(name), rtol=1e-4, atol=1e-4)
+
+
+def test_save_and_load(tmp_path, device):
+    """A film read back is the same, bit for bit, and goes on from there."""
+    film = ir.render(cornell_box(), SETTINGS, device=device)
+    film.save(tmp_path / "film.npz")
+    back = ir.Film.load(tmp_path / "film.npz", device)
+    assert (back.width, back.height, back.iterations) == (12, 8, 6)
+    np.testing.assert_array_equal(back.radiance(), film.radiance())
+    np.testing.assert_array_equal(back.aov("position"), film.aov("position"))
+    back.merge(film)
+    assert back.iterations == 12
+    with pytest.raises(ir.InputError, match="not a film"):
+        ir.Film.load(tmp_path / "missing.npz")
+
+
+def test_aovs_of_a_known_view(device):
+    """In the Cornell box: alpha is 1 in the middle, depth of the back wall 800 + 559.2, normals face the camera."""
+    film = ir.render(cornell_box(), ir.RenderSettings(width=64, height=64, light_paths=1, iterations=4), device=device)
+    top = film.aov("position")[6, 32]
+    assert film.aov("alpha")[32, 32] == 1.0
+    back = film.aov("position")[22, 40]
+    np.testing.assert_allclose(back[2], 559.2, rtol=1e-4)
+    np.testing.assert_allclose(film.aov("depth")[22, 40], 800.0 + 559.2, rtol=1e-4)
+    np.testing.assert_allclose(film.aov("normal")[22, 40], [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(film.aov("albedo")[22, 40], [0.725, 0.71, 0.68], rtol=1e-5)
+    assert cornell_box().meshes[film.aov("prim_id")[22, 40]].name == "back"
+    assert top[1] == pytest.approx(548.8, rel=1e-3)
+    with pytest.raises(ir.InputError, match="no 'colour'"):
+        film.aov("colour")
+
+
+def test_an_empty_film(device):
+    """Before the first iteration a film is black, uncertain and covers nothing."""
+    film = Renderer(furnace(level=1), SETTINGS, device=device).new_film()
+    assert film.radiance().max() == 0.0 and math.isnan(film.error())
+    assert np.isinf(film.standard_error()).all()
+    assert film.aov("alpha").max() == 0.0 and film.aov("prim_id").max() == -1
+
+
+def test_films_of_different_size_do_not_merge(device):
+    """Merging needs the same number of pixels."""
+    renderer = Renderer(furnace(level=1), SETTINGS, device=device)
+    other = Renderer(furnace(level=1), ir.RenderSettings(width=5, height=5), device=device)
+    with pytest.raises(ir.InputError, match="cannot merge 5x5 into 12x8"):
+        renderer.new_film().merge(other.new_film())
+
+
+def test_values_that_are_not_finite_stay_out(device):
+    """A sample of infinity or NaN counts as black and is counted; the others of the pixel stand."""
+    renderer = Renderer(furnace(0.0, 1.0, level=1), SETTINGS, device=device)
+    film = renderer.new_film()
+    renderer.add_iteration(film, 0)
+    bad = np.full((96, 3), 1.0, np.float32)
+    bad[5], bad[6, 1] = np.inf, np.nan
+    renderer._direct.assign(bad)
+    film.add(renderer._gbuffer, renderer._direct, renderer._indirect)
+    assert film.rejected == 2
+    image = film.radiance().reshape(-1, 3)
+    np.testing.assert_array_equal(image[[5, 6]], 0.5)
+    np.testing.assert_array_equal(image[7:], 1.0)

@@ -1,0 +1,81 @@
+"""Rays start off the surface they leave, at any scale, and find the next one."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_ir as ir
+from warp_ir import sampling
+from warp_ir.device_scene import SceneData, upload_scene
+from warp_ir.procedural import cube, mesh, sphere
+from warp_ir.surface import closest, visible
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _bounce(first: int, scene: SceneData, origin: wp.vec3, self_hits: wp.array[wp.int32], escapes: wp.array[wp.int32]):
+    """From inside, to a surface, and from there into the half-space behind it: nothing but that surface is there."""
+    i = first + wp.tid()
+    u = sampling.sample_2d(scene.sobol, i, 0, wp.uint32(1))
+    hit = closest(scene, origin, sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0)), 3.0e38)
+    if hit.triangle < 0:
+        escapes[i] = 1
+    else:
+        v = sampling.sample_2d(scene.sobol, i, 2, wp.uint32(1))
+        out = sampling.to_cosine_hemisphere(v, hit.normal)
+        onward = closest(scene, hit.position, out, 3.0e38)
+        if onward.triangle == hit.triangle:
+            self_hits[i] = 1
+        if onward.triangle < 0:
+            escapes[i] = 1
+        elif not visible(scene, hit.position, wp.vec4(onward.position[0], onward.position[1], onward.position[2], 1.0)):
+            self_hits[i] = 1
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
+@pytest.mark.parametrize("shift", [0.0, 1e5])
+@pytest.mark.parametrize("shape", ["sphere", "cube"])
+def test_no_ray_hits_where_it_starts(launcher, scale, shift, shape):
+    """In a closed room no ray hits its own triangle, none escapes, and what it hits can be seen from where it started."""
+    points, triangles = sphere(level=4) if shape == "sphere" else cube()
+    room = mesh("room", (points + shift) * scale, triangles)
+    uploaded = upload_scene(ir.Scene(meshes=(room,)), launcher)
+    n = 20_000
+    self_hits, escapes = launcher.zeros(n, wp.int32), launcher.zeros(n, wp.int32)
+    origin = wp.vec3(0.01, 0.02, 0.005)
+    launcher.launch(_bounce, n, [uploaded.data, origin, self_hits, escapes])
+    assert self_hits.numpy().sum() == 0
+    assert escapes.numpy().sum() == 0
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(triangles=np.array([[0, 1, 8]], np.int32), material=np.zeros(1, np.int32)), "refer to points outside"),
+        (dict(triangles=np.array([[0, 1, -1]], np.int32), material=np.zeros(1, np.int32)), "refer to points outside"),
+        (dict(triangles=np.zeros((2, 4), np.int32)), "shape"),
+        (dict(points=np.full((8, 3), np.nan)), "finite"),
+        (dict(points=np.full((8, 3), np.inf)), "finite"),
+        (dict(material=np.full(12, 5, np.int32)), "materials outside"),
+        (dict(material=np.zeros(3, np.int32)), "one index per triangle"),
+        (dict(normals=np.zeros((1, 3, 3), np.float32)), "normals must have shape"),
+        (dict(colors=np.full((12, 3, 3), 2.0, np.float32)), "colors must lie"),
+    ],
+)
+def test_bad_meshes_never_reach_warp(launcher, change, message):
+    """What would crash Warp, or read memory that is not there, is an error that names the mesh."""
+    import dataclasses
+
+    bad = dataclasses.replace(mesh("/World/bad", *cube()), **change)
+    with pytest.raises(ir.InputError, match=f"/World/bad: .*{message}"):
+        upload_scene(ir.Scene(meshes=(bad,)), launcher)
+
+
+@pytest.mark.parametrize("triangles", [np.zeros((0, 3)), [[0, 0, 0]], [[0, 1, 1]]])
+def test_empty_and_degenerate_meshes_render(triangles):
+    """A scene without a single proper triangle is a black picture, not a crash."""
+    scene = ir.Scene(meshes=(mesh("m", [[0, 0, 0], [1, 0, 0]], triangles),), lights=(ir.Light("d", 6, (1, 1, 1)),))
+    for estimator in ("keller", "path"):
+        film = ir.render(scene, ir.RenderSettings(width=4, height=4, iterations=1, estimator=estimator))
+        assert film.radiance().max() == 0.0

@@ -1,0 +1,232 @@
+"""Stages as a whole: opening, troubles, time, transforms, visibility and purpose."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_ir import InputError, LightKind, Scene, load_usd
+
+ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
+FILES = sorted(p for p in ASSETS.rglob("*") if p.suffix in (".usd", ".usda", ".usdc", ".usdz"))
+
+TRIANGLE = """
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    uniform token subdivisionScheme = "none"
+"""
+
+
+def load(folder: Path, text: str, **options: object) -> Scene:
+    file = folder / "stage.usda"
+    file.write_text("#usda 1.0\n" + text)
+    return load_usd(file, **options)
+
+
+def warned(scene: Scene, *words: str) -> bool:
+    return any(all(word in line for word in words) for line in scene.warnings)
+
+
+@pytest.mark.parametrize("name", ["missing.usda", ".", "text.usda", "picture.png"])
+def test_what_is_no_stage_is_one_line_that_names_it(tmp_path, name):
+    """A missing file, a folder, a syntax error and another format are input errors of one line."""
+    (tmp_path / "text.usda").write_text("#usda 1.0\ndef Mesh {")
+    (tmp_path / "picture.png").write_text("no picture")
+    with pytest.raises(InputError) as error:
+        load_usd(str(tmp_path / name))
+    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"purposes": ("default", "beauty")}, {"purposes": "render"}, {"time": np.nan}, {"default_light": "headlight"}],
+)
+def test_wrong_arguments_are_input_errors(tmp_path, options):
+    """An argument outside its set is refused before anything is read."""
+    with pytest.raises(InputError):
+        load(tmp_path, "", **options)
+
+
+def test_an_empty_stage_loads(tmp_path, capfd):
+    """An empty stage is a scene: no geometry, the default dome, a framing camera; each is said."""
+    scene = load(tmp_path, "")
+    assert scene.meshes == () and [light.kind for light in scene.lights] == [LightKind.DOME]
+    assert warned(scene, "no geometry") and warned(scene, "nothing emits") and warned(scene, "no camera")
+    assert scene.name == str(tmp_path / "stage.usda")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_default_light_can_be_declined(tmp_path):
+    """With default_light="none" a dark stage stays dark."""
+    assert load(tmp_path, "", default_light="none").lights == ()
+
+
+def test_strict_makes_the_first_warning_an_error(tmp_path):
+    """strict=True raises what would have been a warning."""
+    with pytest.raises(InputError, match="no geometry"):
+        load(tmp_path, "", strict=True)
+
+
+def test_composition_errors_are_listed_once_and_not_spilled(tmp_path, capfd):
+    """A missing reference is a warning, the rest is loaded, and stderr stays empty."""
+    scene = load(tmp_path, f'def "A" (references = @gone.usda@) {{\n}}\ndef Mesh "M" {{{TRIANGLE}}}')
+    assert sum("gone.usda" in line for line in scene.warnings) == 1
+    assert len(scene.meshes) == 1 and scene.stats["composition_errors"] == 1
+    assert capfd.readouterr() == ("", "")
+
+
+def test_metadata_of_the_wrong_kind_do_not_stop_the_load(tmp_path):
+    """An unknown upAxis is read as Y; a wrongly typed metersPerUnit does not matter."""
+    scene = load(tmp_path, f'(upAxis = "X"\n metersPerUnit = 0.0)\ndef Mesh "M" {{{TRIANGLE}}}')
+    assert warned(scene, "upAxis") and len(scene.meshes) == 1
+
+
+def test_one_bad_prim_does_not_stop_the_others(tmp_path):
+    """A prim that cannot be read is named and skipped; prims with the same trouble share a line."""
+    bad = TRIANGLE.replace("[0, 1, 2]", "[0, 1, 7]")
+    scene = load(tmp_path, "\n".join(f'def Mesh "B{i}" {{{bad}}}' for i in range(7)) + f'def Mesh "M" {{{TRIANGLE}}}')
+    assert [mesh.name for mesh in scene.meshes] == ["/M"]
+    assert warned(scene, "/B0, ", "and 3 more", "point 7 of 3", "skipped")
+
+
+def test_the_default_time_is_the_start_of_the_stage(tmp_path):
+    """Without a time the stage's start is loaded, as usdrecord does; values are interpolated in between."""
+    text = f"""(startTimeCode = 10)
+def Mesh "M" {{{TRIANGLE}
+    double3 xformOp:translate.timeSamples = {{ 0: (0, 0, 0), 10: (1, 0, 0), 20: (3, 0, 0) }}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}"""
+    assert load(tmp_path, text).meshes[0].points[0, 0] == 1.0
+    assert load(tmp_path, text, time=15.0).meshes[0].points[0, 0] == 2.0
+
+
+def test_transforms_accumulate_and_can_be_reset(tmp_path):
+    """A child moves with its parent unless it resets the stack."""
+    move = 'double3 xformOp:translate = (5, 0, 0)\n uniform token[] xformOpOrder = [{}"xformOp:translate"]'
+    scene = load(
+        tmp_path,
+        f"""def Xform "A" {{
+    {move.format("")}
+    def Mesh "Child" {{{TRIANGLE} {move.format("")}
+    }}
+    def Mesh "Reset" {{{TRIANGLE} {move.format('"!resetXformStack!", ')}
+    }}
+}}""",
+    )
+    assert [mesh.points[0, 0] for mesh in scene.meshes] == [10.0, 5.0]
+
+
+@pytest.mark.parametrize("op", ["double3 xformOp:translate = (nan, 0, 0)", "token xformOp:bad = 'x'"])
+def test_an_unreadable_transform_is_the_identity(tmp_path, op):
+    """NaN and unknown transform ops are reported, and the prim stays where its parent is."""
+    name = op.split()[1]
+    scene = load(
+        tmp_path,
+        f"""def Mesh "M" {{{TRIANGLE}
+    {op}
+    uniform token[] xformOpOrder = ["{name}"]
+}}""",
+    )
+    assert warned(scene, "/M", "transform") and scene.meshes[0].points[0, 0] == 0.0
+
+
+def test_an_invisible_ancestor_hides_geometry_and_lights(tmp_path):
+    """Nothing below an invisible prim is drawn or shines, whatever its own visibility says."""
+    scene = load(
+        tmp_path,
+        f"""def Xform "A" {{
+    token visibility = "invisible"
+    def Mesh "M" {{{TRIANGLE} token visibility = "inherited"
+    }}
+    def SphereLight "L" {{
+    }}
+}}""",
+    )
+    assert scene.meshes == () and [light.name for light in scene.lights] == ["default dome"]
+    assert scene.stats["prims_invisible"] == 1
+
+
+def test_purposes_select_what_is_drawn(tmp_path):
+    """default and render are drawn; proxy and guide are not; a purpose is inherited."""
+    text = "\n".join(
+        f"""def Xform "{purpose}" {{
+    uniform token purpose = "{purpose}"
+    def Mesh "M" {{{TRIANGLE}}}
+}}"""
+        for purpose in ("default", "render", "proxy", "guide")
+    )
+    assert [mesh.name for mesh in load(tmp_path, text).meshes] == ["/default/M", "/render/M"]
+    assert [mesh.name for mesh in load(tmp_path, text, purposes=("proxy",)).meshes] == ["/proxy/M"]
+    assert load(tmp_path, text).stats["prims_other_purpose"] == 2
+
+
+def test_a_stage_of_proxies_says_so(tmp_path):
+    """If only proxies could be drawn, the warning hints at the purposes."""
+    scene = load(tmp_path, f'def Mesh "M" {{{TRIANGLE} uniform token purpose = "proxy"\n}}')
+    assert warned(scene, "no geometry", "proxies")
+
+
+def test_classes_overs_and_inactive_prims_are_not_drawn(tmp_path):
+    """Only defined, active, concrete prims count; children of unknown types do."""
+    scene = load(
+        tmp_path,
+        f"""class Mesh "C" {{{TRIANGLE}}}
+over Mesh "O" {{{TRIANGLE}}}
+def Mesh "I" (active = false) {{{TRIANGLE}}}
+def Whatever "W" {{ def Mesh "M" {{{TRIANGLE}}}
+}}""",
+    )
+    assert [mesh.name for mesh in scene.meshes] == ["/W/M"]
+
+
+def test_only_the_default_level_of_detail_is_drawn(tmp_path):
+    """The children of a level-of-detail root are alternatives."""
+    scene = load(
+        tmp_path,
+        f"""def Xform "L" (prepend apiSchemas = ["LODRootAPI"]) {{
+    def Mesh "Fine" {{{TRIANGLE}}}
+    def Mesh "Coarse" {{{TRIANGLE}}}
+}}""",
+    )
+    assert [mesh.name for mesh in scene.meshes] == ["/L/Fine"]
+
+
+def test_types_that_are_not_rendered_are_named_once_with_their_count(tmp_path):
+    """Points and curves are warned about per type."""
+    scene = load(tmp_path, 'def Points "A" {\n}\ndef Points "B" {\n}\ndef BasisCurves "C" {\n}')
+    assert warned(scene, "/A, /B", "Points", "2 in all") and warned(scene, "/C", "BasisCurves")
+
+
+def _survives(file: Path) -> None:
+    try:
+        scene = load_usd(file)
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    for mesh in scene.meshes:
+        assert np.isfinite(mesh.points).all() and mesh.triangles.dtype == np.int32 and len(mesh.triangles) > 0
+        assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.points)
+        assert mesh.material.shape == mesh.triangles.shape[:1] and mesh.material.dtype == np.int32
+        assert mesh.material.min() >= 0 and mesh.material.max() < len(scene.materials)
+        for corners in (mesh.normals, mesh.colors):
+            assert corners is None or corners.shape == (*mesh.triangles.shape, 3)
+            assert corners is None or (corners.dtype == np.float32 and np.isfinite(corners).all())
+    for light in scene.lights:
+        assert np.isfinite(light.radiance).all() and max(light.radiance) > 0.0
+    assert all(0.0 <= channel <= 1.0 for material in scene.materials for channel in material.albedo)
+    assert all("\n" not in line for line in scene.warnings)
+
+
+@pytest.mark.skipif(not FILES, reason="the collection of real files is not here")
+def test_some_real_files_survive():
+    """Every 16th file of the collection loads into consistent records, or is refused in one line."""
+    for file in FILES[::16]:
+        _survives(file)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ASSETS)))
+def test_every_real_file_survives(file):
+    """Any file loads into consistent records, or is refused in one line."""
+    _survives(file)

@@ -1,0 +1,172 @@
+"""Pictures of the method at work: the virtual point lights in the scene they belong to.
+
+Drawn off-screen by PyVista: no display is needed.
+"""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ir.image import check_output, whole_file
+from warp_ir.scene import Camera, InputError, Projection, Scene
+
+_DECADES = 4.0
+"""VPLs this many powers of ten below the strongest are drawn at the least brightness."""
+_POINT_SIZES = (14.0, 10.0, 7.0, 5.0, 4.0)
+"""Pixels of VPLs of bounce 0, 1, ...; the last stands for all others. At a picture 1000 pixels high."""
+_BACKGROUND = "#16181d"
+
+
+def picture_vpls(
+    scene: Scene,
+    vpls: Any,
+    path: str | os.PathLike[str],
+    *,
+    view: str = "outside",
+    width: int = 1024,
+    height: int | None = None,
+) -> Path:
+    """Draws virtual point lights as dots in the scene.
+
+    Hue is the VPL's own, brightness the logarithm of its flux, size its bounce (the earlier, the
+    larger). Directional VPLs (sun and sky) have no place; an inscription counts them.
+
+    Args:
+        scene: The scene the VPLs were traced in.
+        vpls: A record as `trace_vpls` returns it.
+        path: The `.png` file to write.
+        view: "outside" looks down on everything, through the walls that are in the way; "camera" is the
+            scene's own camera.
+        width: Pixels.
+        height: Pixels; by default from the camera's aspect, or 3/4 of the width from outside.
+
+    Raises:
+        InputError: The file cannot be written, or the view is unknown.
+    """
+    path = check_output(path, (".png",))
+    if view not in ("outside", "camera"):
+        raise InputError(f"view: must be outside or camera, is {view!r}")
+    if height is None:
+        height = max(1, round(width / scene.camera.aspect)) if view == "camera" else max(1, 3 * width // 4)
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    plotter = pyvista.Plotter(off_screen=True, window_size=(width, height), lighting="none")
+    try:
+        plotter.set_background(_BACKGROUND)
+        camera = scene.camera.fit(width, height) if view == "camera" else _outside(scene, width / height)
+        _add_meshes(plotter, scene, camera, open_front=view == "outside")
+        _add_points(plotter, vpls, height)
+        _aim(plotter, camera)
+        with whole_file(path) as temporary:
+            plotter.screenshot(str(temporary))
+    finally:
+        plotter.close()
+    return path
+
+
+def _outside(scene: Scene, aspect: float) -> Camera:
+    """A camera that sees all of the scene, from the side of the scene's own camera and from above."""
+    lower, upper = scene.bounds()
+    center, radius = 0.5 * (lower + upper), 0.5 * (scene.extent or 1.0)
+    right, up, back = (scene.camera.world_from_camera[:3, k] for k in range(3))
+    direction = back + 0.45 * right + 0.35 * up
+    fov = 30.0
+    distance = 1.05 * radius / math.sin(math.radians(fov) / 2.0) / min(1.0, aspect)
+    eye = center + distance * direction / np.linalg.norm(direction)
+    return Camera.look_at(eye, center, up, fov=fov, aspect=aspect)
+
+
+def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool) -> None:
+    """The surfaces in their albedo, dimmed, and shaded by how they face the camera.
+
+    From outside, the triangles in front that face away from the middle of the scene (the near walls,
+    however they are wound) are left out, so that one can look in.
+    """
+    import pyvista
+
+    lower, upper = scene.bounds()
+    eye, center = camera.world_from_camera[:3, 3], 0.5 * (lower + upper)
+    for mesh in scene.meshes:
+        corners = mesh.points[mesh.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        middle = corners.mean(axis=1)
+        to_eye = eye - middle
+        facing = np.einsum("nk,nk->n", normals, to_eye) / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-300)
+        albedo = np.array([m.albedo for m in scene.materials])[mesh.material]
+        if mesh.colors is not None:
+            albedo = mesh.colors.mean(axis=1)
+        shade = np.clip(albedo, 0.0, 1.0) ** (1 / 2.2) * (0.25 + 0.35 * np.abs(facing))[:, None]
+        keep = np.ones(len(middle), dtype=bool)
+        if open_front:
+            # A wall is a plane with the whole scene on its far side.
+            span = scene.extent or 1.0
+            outward = normals * np.sign(facing)[:, None]
+            reach = np.abs(outward) @ (0.5 * (upper - lower))
+            keep = np.einsum("nk,nk->n", outward, middle - center) < reach - 0.02 * span
+        if not keep.any():
+            continue
+        surface = pyvista.PolyData.from_regular_faces(mesh.points, mesh.triangles[keep])
+        surface.cell_data["shade"] = np.round(255.0 * shade[keep]).astype(np.uint8)
+        plotter.add_mesh(surface, scalars="shade", rgb=True, lighting=False)
+
+
+def _add_points(plotter: Any, vpls: Any, height: int) -> None:
+    """A dot for each VPL that has a place."""
+    import pyvista
+
+    local = ~np.asarray(vpls.directional, dtype=bool)
+    positions = np.asarray(vpls.positions)[local]
+    bounce = np.minimum(np.asarray(vpls.bounce)[local], len(_POINT_SIZES) - 1)
+    colors = dot_colors(np.asarray(vpls.intensity)[local])
+    for k, size in enumerate(_POINT_SIZES):
+        if (bounce == k).any():
+            cloud = pyvista.PolyData(np.ascontiguousarray(positions[bounce == k], dtype=np.float32))
+            cloud.point_data["shine"] = colors[bounce == k]
+            size = max(1.0, size * height / 1000.0)
+            plotter.add_mesh(
+                cloud, scalars="shine", rgb=True, lighting=False, point_size=size, render_points_as_spheres=True
+            )
+    if not local.all():
+        count = int(np.count_nonzero(~local))
+        plotter.add_text(f"and {count} directional VPLs", font_size=max(6, height // 80), color="white")
+
+
+def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+    """Screen colours of VPLs, uint8 [n, 3]: the hue of the intensity, its logarithm as the brightness.
+
+    Args:
+        intensity: [n, 3]; its scale does not matter.
+    """
+    power = np.asarray(intensity, dtype=np.float64)
+    peak = power.max(axis=1, initial=0.0)
+    strongest = float(peak.max(initial=0.0))
+    hue = power / np.maximum(peak, 1e-300)[:, None]
+    with np.errstate(divide="ignore"):
+        decades = np.log10(peak / strongest) if strongest > 0.0 else np.full(len(peak), -np.inf)
+    brightness = 0.3 + 0.7 * np.clip(1.0 + decades / _DECADES, 0.0, 1.0)
+    return np.round(255.0 * brightness[:, None] * hue ** (1.0 / 2.2)).astype(np.uint8)
+
+
+def _aim(plotter: Any, camera: Camera) -> None:
+    """Gives VTK's camera the place, direction and window of ours."""
+    left, right, bottom, top = camera.window
+    matrix = camera.world_from_camera
+    vtk_camera = plotter.camera
+    vtk_camera.position = tuple(matrix[:3, 3])
+    vtk_camera.focal_point = tuple(matrix[:3, 3] - matrix[:3, 2])
+    vtk_camera.up = tuple(matrix[:3, 1])
+    # VTK's window is symmetric, and shifted in units of its half size.
+    vtk_camera.SetWindowCenter((right + left) / (right - left), (top + bottom) / (top - bottom))
+    if camera.projection == Projection.ORTHOGRAPHIC:
+        vtk_camera.parallel_projection = True
+        vtk_camera.parallel_scale = 0.5 * (top - bottom)
+    else:
+        vtk_camera.view_angle = math.degrees(2.0 * math.atan(0.5 * (top - bottom)))
+    plotter.renderer.ResetCameraClippingRange()
