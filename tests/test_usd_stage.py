@@ -85,7 +85,7 @@ def test_metadata_of_the_wrong_kind_do_not_stop_the_load(tmp_path):
 def test_one_bad_prim_does_not_stop_the_others(tmp_path):
     """A prim that cannot be read is named and skipped; prims with the same trouble share a line."""
     bad = TRIANGLE.replace("[0, 1, 2]", "[0, 1, 7]")
-    scene = load(tmp_path, "\n".join(f'def Mesh "B{i}" {{{bad}}}' for i in range(7)) + f'def Mesh "M" {{{TRIANGLE}}}')
+    scene = load(tmp_path, "\n".join(f'def Mesh "B{i}" {{{bad}}}' for i in range(7)) + f'\ndef Mesh "M" {{{TRIANGLE}}}')
     assert [mesh.name for mesh in scene.meshes] == ["/M"]
     assert warned(scene, "/B0, ", "and 3 more", "point 7 of 3", "skipped")
 
@@ -148,7 +148,7 @@ def test_an_invisible_ancestor_hides_geometry_and_lights(tmp_path):
 
 
 def test_purposes_select_what_is_drawn(tmp_path):
-    """default and render are drawn; proxy and guide are not; a purpose is inherited."""
+    """The purposes default and render are drawn; proxy and guide are not; a purpose is inherited."""
     text = "\n".join(
         f"""def Xform "{purpose}" {{
     uniform token purpose = "{purpose}"

@@ -55,7 +55,7 @@ def furnace(albedo: float = 0.5, emission: float = 1.0, *, shape: str = "sphere"
     )
 
 
-def floor(light: Light, *, albedo: float = 1.0, size: float = 100.0, height: float = 1.0e-3) -> Scene:
+def floor(light: Light, *, albedo: float = 1.0, size: float = 100.0, height: float = 1.0e-6) -> Scene:
     """A light over the plane y = 0, seen at the origin from just above: L = ρ E / π, with nothing to bounce from.
 
     The camera is orthographic and its window `height` wide, so that every pixel shows the origin.

@@ -30,7 +30,8 @@ MAX_SURVIVAL = 0.999
 _MAX_SURVIVAL = wp.constant(MAX_SURVIVAL)
 _MAX_REFLECTIVITY = 0.98
 """Likewise the mean reflectivity of fractional absorption."""
-_FIRST_BOUNCE_DIMENSION = wp.constant(7)  # 0: which light, 1-2: where, 3-4: direction, 5-6: place of a distant photon
+# Dimensions 0-1: where on the light (the best pair), 2: which light, 3-4: direction, 5-6: place of a distant photon.
+_FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _UNLIMITED = 2**31 - 1
 
 
@@ -74,8 +75,8 @@ def _trace_paths(
         slot = offsets[i]
     begin = slot
 
-    u_pick = sampling.sample_1d(scene.sobol, i, 0, settings.scramble)
-    u = sampling.sample_2d(scene.sobol, i, 1, settings.scramble)
+    u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
+    u = sampling.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     share = 1.0 / float(settings.paths)
     if store == 1:
