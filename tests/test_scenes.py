@@ -117,7 +117,7 @@ def test_furnaces_are_closed_and_face_inward(name):
 
 
 def test_corridor_light_cannot_be_seen_nor_light_what_the_camera_sees():
-    """The lamp shines along +x from x = 5.2; sight past the inner corner ends before that."""
+    """The lamp shines along +x from x = 3; sight past the inner corner ends before that."""
     stage = _open("corridor")
     lamp = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/Lights/Lamp"))
     np.testing.assert_allclose(-np.array(lamp)[2, :3], (1, 0, 0), atol=1e-6)

@@ -1,0 +1,148 @@
+"""Cameras: which one, what it sees, and the one that frames the scene."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_ir import InputError, Projection, Scene, load_usd
+
+
+def load(folder: Path, text: str, **options: object) -> Scene:
+    file = folder / "stage.usda"
+    file.write_text("#usda 1.0\n" + text)
+    return load_usd(file, **options)
+
+
+def warned(scene: Scene, *words: str) -> bool:
+    return any(all(word in line for word in words) for line in scene.warnings)
+
+
+def camera_text(more: str = "", name: str = "C") -> str:
+    return f'def Camera "{name}" {{\n    {more}\n}}\n'
+
+
+def test_the_window_of_the_default_camera(tmp_path):
+    """The window is the aperture over the focal length; units cancel."""
+    camera = load(tmp_path, camera_text()).camera
+    x, y = 0.5 * 20.955 / 50, 0.5 * 15.2908 / 50
+    assert camera.window == pytest.approx((-x, x, -y, y)) and camera.projection == Projection.PERSPECTIVE
+    assert camera.clipping == (1.0, 1e6) and camera.exposure == 1.0 and camera.name == "/C"
+
+
+def test_aperture_offsets_shift_the_window(tmp_path):
+    """Offsets move the window by offset / focal length."""
+    more = """float horizontalAperture = 20
+    float verticalAperture = 10
+    float focalLength = 10
+    float horizontalApertureOffset = 3
+    float verticalApertureOffset = -1"""
+    assert load(tmp_path, camera_text(more)).camera.window == pytest.approx((-0.7, 1.3, -0.6, 0.4))
+
+
+def test_an_orthographic_window_is_in_scene_units(tmp_path):
+    """Apertures are tenths of a scene unit; the focal length does not matter."""
+    camera = load(tmp_path, camera_text('token projection = "orthographic"\n float focalLength = 0')).camera
+    assert camera.projection == Projection.ORTHOGRAPHIC
+    assert camera.window == pytest.approx((-1.04775, 1.04775, -0.76454, 0.76454))
+
+
+def test_scale_and_mirroring_are_removed_from_the_transform(tmp_path):
+    """world_from_camera is a rotation and a translation."""
+    more = """double3 xformOp:translate = (1, 2, 3)
+    float xformOp:rotateY = 90
+    float3 xformOp:scale = (-2, 3, 4)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateY", "xformOp:scale"]"""
+    matrix = load(tmp_path, camera_text(more)).camera.world_from_camera
+    expected = np.array([[0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])
+    assert matrix == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_collapsed_transform_is_named(tmp_path):
+    """A camera scaled to nothing stands at the origin."""
+    more = 'float3 xformOp:scale = (0, 0, 0)\n uniform token[] xformOpOrder = ["xformOp:scale"]'
+    scene = load(tmp_path, camera_text(more))
+    assert warned(scene, "/C", "degenerate") and (scene.camera.world_from_camera == np.eye(4)).all()
+
+
+def test_exposure_controls_scale_the_film(tmp_path):
+    """The factor is responsivity · time · iso / 100 · 2^exposure / fStop²."""
+    more = """float exposure = 3
+    float exposure:iso = 200
+    float exposure:time = 0.5
+    float exposure:fStop = 2
+    float exposure:responsivity = 1.5"""
+    assert load(tmp_path, camera_text(more)).camera.exposure == pytest.approx(1.5 * 0.5 * 2 * 8 / 4)
+
+
+def test_depth_of_field_and_motion_blur_are_named(tmp_path):
+    """What the picture will lack is said."""
+    scene = load(tmp_path, camera_text("float fStop = 2\n double shutter:close = 0.5"))
+    assert warned(scene, "/C", "depth of field") and warned(scene, "/C", "motion blur")
+
+
+def test_an_empty_clipping_range_clips_nothing(tmp_path):
+    """A far plane before the near plane would hide everything."""
+    scene = load(tmp_path, camera_text("float2 clippingRange = (5, 1)"))
+    assert scene.camera.clipping == (0.0, math.inf) and warned(scene, "/C", "clippingRange")
+
+
+@pytest.mark.parametrize("name", ["focalLength", "horizontalAperture", "verticalAperture"])
+@pytest.mark.parametrize("number", ["0", "-1", "nan", "inf"])
+def test_an_impossible_camera_is_an_error_that_names_it(tmp_path, name, number):
+    """Focal length and apertures must be positive numbers."""
+    with pytest.raises(InputError, match=f"/C.*{name}"):
+        load(tmp_path, camera_text(f"float {name} = {number}"))
+
+
+def test_cameras_are_chosen_by_path_or_name(tmp_path):
+    """A camera is known by its path or its name; an unknown one is an error that lists the others."""
+    text = camera_text(name="A") + 'def Xform "X" {\n' + camera_text(name="B") + "}\n"
+    assert load(tmp_path, text, camera="/X/B").camera.name == "/X/B"
+    assert load(tmp_path, text, camera="B").camera.name == "/X/B"
+    with pytest.raises(InputError, match=r"'D'.*/A, /X/B"):
+        load(tmp_path, text, camera="D")
+
+
+def test_the_order_of_choice(tmp_path):
+    """Render settings come before main_cam, main_cam before the first camera; the first is a guess, and said."""
+    two = camera_text(name="A") + camera_text(name="B")
+    scene = load(tmp_path, two)
+    assert scene.camera.name == "/A" and warned(scene, "/A", "first of 2")
+    text = two + camera_text(name="main_cam")
+    scene = load(tmp_path, text)
+    assert scene.camera.name == "/main_cam" and not warned(scene, "first of")
+    settings = 'def RenderSettings "S" { rel camera = </B>\n}\n'
+    assert load(tmp_path, text + settings).camera.name == "/B"
+    assert load(tmp_path, text + settings, camera="A").camera.name == "/A"
+    product = 'def RenderSettings "S" { rel products = </P>\n}\ndef RenderProduct "P" { rel camera = </B>\n}\n'
+    assert load(tmp_path, text + product).camera.name == "/B"
+    other = 'def RenderSettings "R" { rel camera = </A>\n}\n'
+    assert load(tmp_path, '(renderSettingsPrimPath = "/R")\n' + text + settings + other).camera.name == "/A"
+    scene = load(tmp_path, text + settings.replace("</B>", "</Gone>"))
+    assert scene.camera.name == "/main_cam" and warned(scene, "/S", "/Gone")
+
+
+@pytest.mark.parametrize(("axis", "matrix"), [
+    ("Y", [[1, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, None], [0, 0, 0, 1]]),
+    ("Z", [[1, 0, 0, 10], [0, 0, -1, None], [0, 1, 0, 0], [0, 0, 0, 1]]),
+])  # fmt: skip
+def test_without_a_camera_the_scene_is_framed_as_usdrecord_does(tmp_path, axis, matrix):
+    """A 50 mm camera looks along -Z (Y up) or +Y (Z up) from half the diagonal / tan(fov / 2) + half the depth."""
+    scene = load(tmp_path, f"""(upAxis = "{axis}")
+def Cube "C" {{
+    double3 xformOp:translate = (10, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}""")  # fmt: skip
+    distance = math.hypot(1, 1) / (0.5 * 20.955 / 50) + 1
+    number = -distance if axis == "Z" else distance
+    expected = [[number if entry is None else entry for entry in row] for row in matrix]
+    assert scene.camera.world_from_camera == pytest.approx(np.array(expected, dtype=float), abs=1e-5)
+    assert warned(scene, "no camera", "-Z" if axis == "Y" else "+Y")
+
+
+def test_a_tiny_scene_is_framed_from_beyond_the_near_plane(tmp_path):
+    """As in usdrecord, the camera steps back by 1 where it would stand closer than its near plane."""
+    distance = load(tmp_path, 'def Cube "C" { double size = 0.01\n}').camera.world_from_camera[2, 3]
+    assert distance == pytest.approx(1 + 0.01 * math.sqrt(0.5) / (0.5 * 20.955 / 50) + 0.005)

@@ -1,0 +1,177 @@
+"""Cameras: which one is meant, what it sees, and one that frames the scene where there is none."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Gf, Tf, Usd, UsdGeom, UsdRender, UsdUtils
+
+from warp_ir.scene import Camera, Floats, InputError, Projection
+from warp_ir.usd import value
+from warp_ir.usd.report import Report, Unreadable
+
+_TENTH = 0.1
+"""Apertures and focal lengths are in tenths of a scene unit."""
+
+
+def find_camera(stage: Usd.Stage, name: str | None, report: Report) -> Usd.Prim | None:
+    """The camera to render: named, else of the render settings, else the primary one, else the first.
+
+    Args:
+        stage: The stage.
+        name: Absolute path, or name of a camera prim; None to choose.
+        report: Where a guess is reported.
+
+    Returns:
+        The prim, or None if there is no camera.
+
+    Raises:
+        InputError: There is no camera of that name.
+    """
+    predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+    cameras = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), predicate) if prim.IsA(UsdGeom.Camera)]
+    if name is not None:
+        for prim in cameras:
+            if name in (str(prim.GetPath()), prim.GetName()):
+                return prim
+        available = ", ".join(str(prim.GetPath()) for prim in cameras) or "none"
+        raise InputError(f"{report.source}: no camera '{name}'; available: {available}")
+    by_settings = _camera_of_settings(stage, report)
+    if by_settings is not None:
+        return by_settings
+    primary = UsdUtils.GetPrimaryCameraName()
+    chosen = next((prim for prim in cameras if prim.GetName() == primary), cameras[0] if cameras else None)
+    if chosen is not None and len(cameras) > 1 and chosen.GetName() != primary:
+        report.warn(chosen.GetPath(), f"rendered because it is the first of {len(cameras)} cameras")
+    return chosen
+
+
+def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
+    """The record of a Camera prim.
+
+    Raises:
+        InputError: Its focal length or an aperture is not a positive number.
+    """
+    camera = UsdGeom.Camera(prim)
+
+    def positive(attribute: Usd.Attribute, default: float) -> float:
+        try:
+            length = value.number(attribute, time, default)
+        except Unreadable as trouble:
+            raise InputError(f"{report.source}: camera {prim.GetPath()}: {trouble}") from None
+        if length <= 0.0:
+            raise InputError(f"{report.source}: camera {prim.GetPath()}: {attribute.GetName()} is {length:g}")
+        return length
+
+    def optional(attribute: Usd.Attribute, default: float) -> float:
+        try:
+            return value.number(attribute, time, default)
+        except Unreadable as trouble:
+            report.warn(prim.GetPath(), f"{trouble}; {default:g} is used")
+            return default
+
+    if value.text(camera.GetProjectionAttr(), time) == UsdGeom.Tokens.orthographic:
+        projection, unit = Projection.ORTHOGRAPHIC, _TENTH
+    else:
+        projection, unit = Projection.PERSPECTIVE, 1.0 / positive(camera.GetFocalLengthAttr(), 50.0)
+    half_x = 0.5 * positive(camera.GetHorizontalApertureAttr(), 20.955)
+    half_y = 0.5 * positive(camera.GetVerticalApertureAttr(), 15.2908)
+    x = optional(camera.GetHorizontalApertureOffsetAttr(), 0.0)
+    y = optional(camera.GetVerticalApertureOffsetAttr(), 0.0)
+    if optional(camera.GetFStopAttr(), 0.0) > 0.0:
+        report.warn(prim.GetPath(), "depth of field is not rendered")
+    if optional(camera.GetShutterCloseAttr(), 0.0) > optional(camera.GetShutterOpenAttr(), 0.0):
+        report.warn(prim.GetPath(), "motion blur is not rendered")
+    exposure = _exposure(camera, time)
+    if not (math.isfinite(exposure) and exposure >= 0.0):
+        report.warn(prim.GetPath(), f"its exposure scale is {exposure:g}; 1 is used")
+        exposure = 1.0
+    return Camera(
+        name=str(prim.GetPath()),
+        world_from_camera=_rigid(prim, time, report),
+        window=((x - half_x) * unit, (x + half_x) * unit, (y - half_y) * unit, (y + half_y) * unit),
+        projection=projection,
+        clipping=_clipping(camera, time, report),
+        exposure=exposure,
+    )
+
+
+def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
+    """The camera with which `usdrecord` shows a stage that has none (its `_ComputeCameraToFrameStage`).
+
+    Args:
+        lower: Corner of the scene's bounds, [3].
+        upper: The opposite corner.
+        up_axis: "Y": it looks along -Z; "Z": along +Y.
+    """
+    default = Gf.Camera()
+    half_x = 0.5 * default.horizontalAperture / default.focalLength
+    half_y = 0.5 * default.verticalAperture / default.focalLength
+    size, matrix = upper - lower, np.eye(4)
+    width, height, depth = (size[0], size[1], size[2]) if up_axis == "Y" else (size[0], size[2], size[1])
+    distance = 0.5 * math.hypot(width, height) / half_x + 0.5 * depth
+    if distance < default.clippingRange.min:
+        distance += 1.0
+    if up_axis == "Z":
+        matrix[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    matrix[:3, 3] = 0.5 * (lower + upper) + distance * matrix[:3, 2]
+    return Camera("framing camera", matrix, (-half_x, half_x, -half_y, half_y))
+
+
+def _camera_of_settings(stage: Usd.Stage, report: Report) -> Usd.Prim | None:
+    """The camera that the stage's RenderSettings (or their first product) name."""
+    settings = UsdRender.Settings.GetStageRenderSettings(stage)
+    owners: Sequence[Usd.Prim] = [settings.GetPrim()] if settings else []
+    if not owners:
+        owners = [prim for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
+    for owner in owners:
+        products = UsdRender.Settings(owner).GetProductsRel().GetForwardedTargets()
+        for prim in (owner, *map(stage.GetPrimAtPath, products)):
+            if not prim:
+                continue
+            for path in UsdRender.SettingsBase(prim).GetCameraRel().GetForwardedTargets():
+                target = stage.GetPrimAtPath(path)
+                if target and target.IsA(UsdGeom.Camera):
+                    return target
+                report.warn(prim.GetPath(), f"its camera {path} is not a camera of the stage")
+    return None
+
+
+def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
+    """world_from_camera without scale and shear; a mirrored camera keeps its view and up directions."""
+    try:
+        matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)).T
+    except Tf.ErrorException as trouble:
+        report.warn(prim.GetPath(), f"its transform cannot be read: {trouble}")
+        return np.eye(4)
+    back, up = matrix[:3, 2], matrix[:3, 1]
+    right = np.cross(up, back)
+    if not (np.isfinite(matrix).all() and np.linalg.norm(right) > 0.0):
+        report.warn(prim.GetPath(), "its transform is degenerate; the camera stands at the origin")
+        return np.eye(4)
+    rigid = np.eye(4)
+    rigid[:3, 2] = back / np.linalg.norm(back)
+    rigid[:3, 0] = right / np.linalg.norm(right)
+    rigid[:3, 1] = np.cross(rigid[:3, 2], rigid[:3, 0])
+    rigid[:3, 3] = matrix[:3, 3]
+    return rigid
+
+
+def _clipping(camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report) -> tuple[float, float]:
+    near_far = value.raw(camera.GetClippingRangeAttr(), time)
+    try:
+        near, far = (float(distance) for distance in near_far)
+    except (TypeError, ValueError):
+        near, far = math.nan, math.nan
+    if not (near < far and far > 0.0):
+        report.warn(camera.GetPath(), f"clippingRange {near_far} is empty; nothing is clipped")
+        return 0.0, math.inf
+    return max(near, 0.0), far
+
+
+def _exposure(camera: UsdGeom.Camera, time: Usd.TimeCode) -> float:
+    """Factor on the film's radiance, from the schema's exposure controls."""
+    try:
+        return float(camera.ComputeLinearExposureScale(time))
+    except (AttributeError, Tf.ErrorException):  # the schema gained its exposure controls in 25.05
+        return 1.0

@@ -1,0 +1,52 @@
+"""Gprims that are lights (LightAPI, MeshLightAPI): their surface emits, so they become emissive materials."""
+
+from dataclasses import replace
+
+import numpy as np
+from pxr import Usd
+
+from warp_ir.scene import Material
+from warp_ir.usd import value
+from warp_ir.usd.light import Inputs, as_color, emission, warn_of_unread
+from warp_ir.usd.report import Report, Unreadable
+
+
+def glow(prim: Usd.Prim, materials: list[Material], area: float, time: Usd.TimeCode, report: Report) -> list[Material]:
+    """The materials of a gprim with LightAPI, with what the light adds to them.
+
+    light:materialSyncMode decides: `materialGlowTintsLight` multiplies the light with the material's own emission
+    (if it has any: else the light emits alone), `noMaterialResponse` leaves a black emitter, `independent` has a
+    glow for the eye and another for the light, which surfaces here cannot tell apart: the light's is used.
+
+    Args:
+        prim: The gprim.
+        materials: Its materials.
+        area: Of one copy in the world, for `normalize`.
+        time: Of the values.
+        report: Where troubles go.
+    """
+    inputs = Inputs(prim, time, report)
+    try:
+        radiance = emission(inputs)
+        if inputs.flag("normalize") and area > 0.0:
+            radiance = radiance / area
+        as_color(radiance)
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{trouble}; it does not emit as a light")
+        return materials
+    warn_of_unread(inputs, None)
+    if radiance.max() == 0.0:
+        report.stats["lights_without_emission"] += 1
+    mode = value.text(prim.GetAttribute("light:materialSyncMode"), time, "noMaterialResponse")
+    if mode == "independent":
+        inputs.warn("materialSyncMode 'independent': the material's own glow is not shown, only the light's")
+    lit = []
+    for material in materials:
+        tint = np.array(material.emission)
+        if mode != "materialGlowTintsLight" or tint.max() == 0.0:
+            tint = np.ones(3)
+        red, green, blue = (radiance * tint).tolist()
+        black = mode == "noMaterialResponse"
+        albedo = (0.0, 0.0, 0.0) if black else material.albedo
+        lit.append(replace(material, name=str(prim.GetPath()), albedo=albedo, emission=(red, green, blue)))
+    return lit

@@ -1,0 +1,143 @@
+"""Point instancers: where each prototype goes, from arrays that cannot be trusted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from warp_ir.scene import Floats, Ints
+from warp_ir.usd import value
+from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.shape import Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """The visible instances of one prototype."""
+
+    prototype: Sdf.Path
+    matrices: Floats
+    """instancer_from_instance, float64 [k, 4, 4]; the prototype's own transform comes before it."""
+    colors: Floats | None
+    """displayColor of each instance, float64 [k, 3], if there are such."""
+
+
+def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[Instances]:
+    """The instances of a PointInstancer, per prototype that has any.
+
+    USD's own ComputeInstanceTransformsAtTime returns uninitialised memory for arrays of wrong length, so the
+    arrays are checked and combined here; scale, then rotation, then translation.
+
+    Raises:
+        Unreadable: positions or protoIndices are missing, of the wrong type or of different lengths.
+    """
+    instancer = UsdGeom.PointInstancer(prim)
+    indices = value.ints(instancer.GetProtoIndicesAttr(), time)
+    positions = value.floats(instancer.GetPositionsAttr(), time, 3)
+    prototypes = instancer.GetPrototypesRel().GetForwardedTargets()
+    if indices is None or len(indices) == 0:
+        return []
+    if positions is None or len(positions) != len(indices):
+        found = 0 if positions is None else len(positions)
+        raise Unreadable(f"it has {len(indices)} protoIndices but {found} positions")
+    count = len(indices)
+    scales = _optional(instancer.GetScalesAttr(), time, 3, count, prim, report)
+    turns = _optional(instancer.GetOrientationsfAttr(), time, 4, count, prim, report)
+    if turns is None:
+        turns = _optional(instancer.GetOrientationsAttr(), time, 4, count, prim, report)
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    if turns is not None:
+        matrices[:, :3, :3] = _rotations(turns)
+    if scales is not None:
+        matrices[:, :3, :3] *= scales[:, None, :]
+    matrices[:, :3, 3] = positions
+    visible = _mask(instancer, count, time, report)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    if not finite.all():
+        report.warn(prim.GetPath(), "{n} instances with NaN or infinite transforms left out", int((~finite).sum()))
+    known = (indices >= 0) & (indices < len(prototypes))
+    if not known.all():
+        report.warn(prim.GetPath(), "{n} instances of prototypes that do not exist left out", int((~known).sum()))
+    visible &= finite & known
+    colors = _colors(prim, count, time, report)
+    groups = []
+    for number, path in enumerate(prototypes):
+        chosen = visible & (indices == number)
+        if chosen.any():
+            groups.append(Instances(path, matrices[chosen], None if colors is None else colors[chosen]))
+    return groups
+
+
+def _optional(
+    attribute: Usd.Attribute, time: Usd.TimeCode, columns: int, count: int, prim: Usd.Prim, report: Report
+) -> Floats | None:
+    """An array with one row per instance; None if it is absent or cannot be used."""
+    try:
+        rows = value.floats(attribute, time, columns)
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{trouble}; ignored")
+        return None
+    if rows is None or len(rows) == 0:
+        return None
+    if len(rows) != count:
+        report.warn(prim.GetPath(), f"{attribute.GetName()} has {len(rows)} values for {count} instances; ignored")
+        return None
+    return rows
+
+
+def _rotations(quaternions: Floats) -> Floats:
+    """Matrices [k, 3, 3] of quaternions [k, 4] in USD's memory order i, j, k, real; 0 means no rotation."""
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    unit = np.where(length > 0.0, quaternions / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 0.0, 1.0])
+    x, y, z, w = unit.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _mask(instancer: UsdGeom.PointInstancer, count: int, time: Usd.TimeCode, report: Report) -> Mask:
+    """Which instances [k] are neither invisible nor inactive; without ids they are known by their index."""
+    path = instancer.GetPath()
+    ids: Ints = np.arange(count)
+    try:
+        authored = value.ints(instancer.GetIdsAttr(), time)
+        hidden = value.ints(instancer.GetInvisibleIdsAttr(), time)
+    except Unreadable as trouble:
+        report.warn(path, f"{trouble}; ignored")
+        authored, hidden = None, None
+    if authored is not None and len(authored) == count:
+        ids = authored
+    elif authored is not None and len(authored):
+        report.warn(path, f"ids has {len(authored)} values for {count} instances; ignored")
+    inactive = instancer.GetPrim().GetMetadata("inactiveIds")
+    off = np.array(inactive.GetAppliedItems() if inactive else [], dtype=np.int64)
+    if hidden is not None:
+        off = np.concatenate([off, hidden])
+    return ~np.isin(ids, off)
+
+
+def _colors(prim: Usd.Prim, count: int, time: Usd.TimeCode, report: Report) -> Floats | None:
+    """A displayColor per instance: an instancer's vertex, varying and faceVarying primvars have one value each."""
+    found = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
+    if not found or not found.HasValue() or found.GetInterpolation() in ("constant", "uniform"):
+        return None
+    try:
+        values = value.floats(found.GetAttr(), time, 3)
+        indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{trouble}; displayColor ignored")
+        return None
+    if values is None or len(values) == 0:
+        return None
+    if indices is not None:
+        if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
+            report.warn(prim.GetPath(), "displayColor: an index is out of range; ignored")
+            return None
+        values = values[indices]
+    if len(values) != count or not np.isfinite(values).all():
+        report.warn(prim.GetPath(), f"displayColor: not one finite colour for each of {count} instances; ignored")
+        return None
+    return value.to_linear_rec709(found.GetAttr(), values).clip(0.0, 1.0)

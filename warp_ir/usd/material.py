@@ -1,0 +1,164 @@
+"""Which material each face has: bindings, subsets and displayColor, gathered into one table without doubles."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from warp_ir.scene import Floats, Ints, Material
+from warp_ir.usd import primvar, value
+from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.shape import Mask, Shape
+from warp_ir.usd.surface import read_material
+
+ABSENT = -1
+"""In place of a material's index: the surface is not there (opacity)."""
+UNBOUND = -2
+"""In place of a material's index: no material that can be read; displayColor decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How the triangles of one prim look."""
+
+    material: Ints
+    """int32 [m], indices into the table, or ABSENT."""
+    colors: Floats | None = None
+    """float32 [m, 3, 3], albedo of the corners where one per triangle is not enough; None elsewhere."""
+    bare: Mask | None = None
+    """bool [m], triangles with neither material nor colour, that an instancer may still colour; None: none."""
+
+    def keep(self, mask: Mask) -> "Look":
+        """The look of the triangles that a mask [m] selects."""
+        colors = None if self.colors is None else self.colors[mask]
+        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask])
+
+
+class MaterialTable:
+    """The scene's materials, each read once.
+
+    Args:
+        time: Of the values.
+        report: Where troubles go.
+    """
+
+    def __init__(self, time: Usd.TimeCode, report: Report) -> None:
+        self.materials: list[Material] = []
+        self._time, self._report = time, report
+        self._known: dict[Material, int] = {}
+        self._read: dict[Sdf.Path, int] = {}
+        self._bound: dict[Sdf.Path, int] = {}
+
+    def add(self, material: Material) -> int:
+        """Index of a material, new or not."""
+        if material not in self._known:
+            self._known[material] = len(self.materials)
+            self.materials.append(material)
+        return self._known[material]
+
+    def resolve(self, prims: Sequence[Usd.Prim]) -> None:
+        """Find the materials bound to prims and to their subsets; at once, for USD shares the work."""
+        prims = [p for prim in prims for p in (prim, *material_subsets(prim))]
+        found, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(prims, UsdShade.Tokens.full)
+        unbound = [prim for prim, material in zip(prims, found, strict=True) if not material]
+        second, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(unbound, UsdShade.Tokens.preview)
+        for prim, material in zip(prims, found, strict=True):
+            if material:
+                self._bound[prim.GetPath()] = self._index_of(material)
+        for prim, material in zip(unbound, second, strict=True):
+            if material:
+                self._report.warn(prim.GetPath(), "only a material for the purpose 'preview' is bound; it is used")
+                self._bound[prim.GetPath()] = self._index_of(material)
+            elif (target := _dangling_target(prim)) is not None:
+                self._report.warn(prim.GetPath(), f"the material it is bound to, {target}, does not exist")
+
+    def look(self, prim: Usd.Prim, shape: Shape) -> Look:
+        """The materials and colours of a prim's triangles; `resolve` has seen the prim."""
+        index = np.full(len(shape.triangles), self._bound.get(prim.GetPath(), UNBOUND), dtype=np.int32)
+        for faces, bound in self._subsets(prim, shape):
+            index[faces[shape.face]] = bound
+        bare = index == UNBOUND
+        if not bare.any():
+            return Look(index)
+        color = primvar.display_color(prim, shape, self._time, self._report)
+        if color is None:
+            index[bare] = self.add(Material("no material"))
+            return Look(index, bare=bare)
+        if color.ndim == 1:
+            red, green, blue = color.tolist()
+            index[bare] = self.add(Material("displayColor", (red, green, blue)))
+            return Look(index)
+        index[bare] = self.add(Material("displayColor"))
+        colors = np.where(bare[:, None, None], color.astype(np.float32), self.albedo(index)[:, None])
+        return Look(index, colors)
+
+    def albedo(self, index: Ints) -> Floats:
+        """The albedo of each material in a list of indices [m], float32 [m, 3]; ABSENT gets any."""
+        table: Floats = np.array([m.albedo for m in self.materials], dtype=np.float32)
+        return table[index]
+
+    def _subsets(self, prim: Usd.Prim, shape: Shape) -> list[tuple[Mask, int]]:
+        """Face masks, bool [faces], with the material bound to them; the first subset of a face wins."""
+        count = shape.elements.get("uniform")
+        pairs: list[tuple[Mask, int]] = []
+        if count is None:
+            return pairs
+        taken = np.zeros(count, dtype=bool)
+        for subset in material_subsets(prim):
+            try:
+                faces = value.ints(UsdGeom.Subset(subset).GetIndicesAttr(), self._time)
+            except Unreadable as trouble:
+                self._report.warn(subset.GetPath(), f"{trouble}; subset ignored")
+                continue
+            if faces is None:
+                continue
+            valid = (faces >= 0) & (faces < count)
+            if not valid.all():
+                self._report.warn(subset.GetPath(), "{n} face indices out of range ignored", int((~valid).sum()))
+            mask = np.zeros(count, dtype=bool)
+            mask[faces[valid]] = True
+            if (mask & taken).any():
+                self._report.warn(
+                    subset.GetPath(), "{n} faces are already in another subset", int((mask & taken).sum())
+                )
+            mask &= ~taken
+            taken |= mask
+            bound = self._bound.get(subset.GetPath(), UNBOUND)
+            if bound != UNBOUND:
+                pairs.append((mask, bound))
+        return pairs
+
+    def _index_of(self, material: UsdShade.Material) -> int:
+        prim = material.GetPrim()
+        path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        if path not in self._read:
+            try:
+                read = read_material(material, self._time, self._report)
+                self._read[path] = ABSENT if read is None else self.add(read)
+            except Unreadable as trouble:
+                self._report.warn(material.GetPath(), str(trouble))
+                self._read[path] = UNBOUND
+        return self._read[path]
+
+
+def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:
+    """The face subsets of a gprim that exist to bind materials, in order."""
+    children = prim.GetFilteredChildren(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+    return [
+        child
+        for child in children
+        if child.IsA(UsdGeom.Subset)
+        and UsdGeom.Subset(child).GetFamilyNameAttr().Get() == UsdShade.Tokens.materialBind
+        and UsdGeom.Subset(child).GetElementTypeAttr().Get() == UsdGeom.Tokens.face
+    ]
+
+
+def _dangling_target(prim: Usd.Prim) -> Sdf.Path | None:
+    """The target of the nearest direct binding, if there is one although nothing could be resolved."""
+    while prim and not prim.IsPseudoRoot():
+        targets = UsdShade.MaterialBindingAPI(prim).GetDirectBindingRel().GetTargets()
+        if targets:
+            return targets[0]
+        prim = prim.GetParent()
+    return None

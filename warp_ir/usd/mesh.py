@@ -1,0 +1,149 @@
+"""UsdGeom Mesh and TetMesh: validated, cut into triangles, with the normals to shade with."""
+
+from dataclasses import replace
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from warp_ir.scene import Floats, Ints
+from warp_ir.usd import primvar, value
+from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.shape import Mask, Shape, cross_products, without_slivers
+from warp_ir.usd.triangulate import triangulate
+
+
+def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
+    """The triangles of a Mesh; None if it has no faces.
+
+    Raises:
+        Unreadable: An array has the wrong type, or counts, indices and points do not belong together.
+    """
+    mesh = UsdGeom.Mesh(prim)
+    points = value.floats(mesh.GetPointsAttr(), time, 3)
+    counts = value.ints(mesh.GetFaceVertexCountsAttr(), time)
+    indices = value.ints(mesh.GetFaceVertexIndicesAttr(), time)
+    if points is None or counts is None or indices is None or len(counts) == 0:
+        return None
+    _check_topology(points, counts, indices)
+    keep = np.ones(len(counts), dtype=bool)
+    holes = value.ints(mesh.GetHoleIndicesAttr(), time)
+    if holes is not None:
+        inside = (holes >= 0) & (holes < len(counts))
+        if not inside.all():
+            report.warn(prim.GetPath(), "{n} hole indices out of range ignored", int((~inside).sum()))
+        keep[holes[inside]] = False
+    keep &= _finite_faces(prim, points, counts, indices, report)
+    corner, face = triangulate(points, counts, indices, keep)
+    if value.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
+        corner = corner[:, ::-1]
+    if value.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark") != UsdGeom.Tokens.none:
+        report.warn(prim.GetPath(), "subdivision surface rendered as its cage ({n} in all)")
+    if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetJointIndicesPrimvar().HasValue():
+        report.warn(prim.GetPath(), "skinning is not read yet: the mesh is in its rest pose ({n} in all)")
+    shape = Shape(
+        points=points,
+        triangles=indices.astype(np.int32)[corner],
+        face=face,
+        corner=corner,
+        elements={
+            "uniform": len(counts),
+            "vertex": len(points),
+            "varying": len(points),
+            "faceVarying": len(indices),
+        },
+    )
+    return _finished(prim, shape, int(keep.sum()), time, report)
+
+
+def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
+    """The surface of a TetMesh, computed if it is not authored; None if it is empty.
+
+    Raises:
+        Unreadable: An array has the wrong type, or indices are out of range.
+    """
+    tets = UsdGeom.TetMesh(prim)
+    points = value.floats(tets.GetPointsAttr(), time, 3)
+    faces = value.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
+    if points is not None and (faces is None or len(faces) == 0):
+        cells = value.ints(tets.GetTetVertexIndicesAttr(), time, 4)
+        if cells is not None and len(cells):
+            _check_range(cells, len(points), "tetVertexIndices")
+            faces = np.asarray(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, time), dtype=np.int64).reshape(-1, 3)
+    if points is None or faces is None or len(faces) == 0:
+        return None
+    _check_range(faces, len(points), "surfaceFaceVertexIndices")
+    counts = np.full(len(faces), 3)
+    keep = _finite_faces(prim, points, counts, faces.reshape(-1), report)
+    corner, face = triangulate(points, counts, faces.reshape(-1), keep)
+    if value.text(tets.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
+        corner = corner[:, ::-1]
+    elements = {
+        "uniform": len(faces),
+        "vertex": len(points),
+        "varying": len(points),
+        "faceVarying": faces.size,
+    }
+    shape = Shape(points, faces.reshape(-1).astype(np.int32)[corner], face, corner, elements=elements)
+    return _finished(prim, shape, int(keep.sum()), time, report)
+
+
+def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
+    if counts.min() < 0:
+        raise Unreadable("faceVertexCounts has negative values")
+    if counts.sum() != len(indices):
+        raise Unreadable(f"faceVertexCounts add up to {counts.sum()}, but faceVertexIndices has {len(indices)}")
+    _check_range(indices, len(points), "faceVertexIndices")
+
+
+def _check_range(indices: Ints, count: int, name: str) -> None:
+    if indices.size and (indices.min() < 0 or indices.max() >= count):
+        worst = indices.min() if indices.min() < 0 else indices.max()
+        raise Unreadable(f"{name} refers to point {worst} of {count}")
+
+
+def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, report: Report) -> Mask:
+    """Which faces [f] touch finite points only."""
+    keep = np.ones(len(counts), dtype=bool)
+    finite = np.asarray(np.isfinite(points).all(axis=1))
+    if finite.all():
+        return keep
+    bad = np.unique(np.repeat(np.arange(len(counts)), counts)[~finite[indices]])
+    if len(bad):
+        report.warn(prim.GetPath(), "{n} faces with infinite or NaN points left out", len(bad))
+    points[~finite] = 0.0  # used by no face now, and harmless to bounds and arithmetic
+    keep[bad] = False
+    return keep
+
+
+def _finished(prim: Usd.Prim, shape: Shape, wanted: int, time: Usd.TimeCode, report: Report) -> Shape:
+    """The shape without slivers and with its normals; of the `wanted` faces, those that vanished are counted."""
+    shape = without_slivers(shape)
+    lost = wanted - int(np.count_nonzero(np.bincount(shape.face))) if len(shape.face) else wanted
+    return _with_normals(prim, replace(shape, degenerate=lost), time, report)
+
+
+def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Shape:
+    """The shape with its authored normals; without any, or if they say no more than the winding, faceted."""
+    authored = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
+    if authored and authored.HasValue():
+        attribute, interpolation = authored.GetAttr(), authored.GetInterpolation()
+        indices = value.ints(authored.GetIndicesAttr(), time) if authored.IsIndexed() else None
+    else:
+        based = UsdGeom.PointBased(prim)
+        attribute, interpolation, indices = based.GetNormalsAttr(), based.GetNormalsInterpolation(), None
+    try:
+        values = value.floats(attribute, time, 3)
+        if values is None or len(values) == 0 or len(shape.triangles) == 0:
+            return shape
+        normals = primvar.expand(shape, values, interpolation, indices)
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{trouble}; the mesh is faceted")
+        return shape
+    geometric = cross_products(shape.points, shape.triangles)
+    geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    usable = np.isfinite(length) & (length > 1e-12)
+    normals = np.where(usable, normals / np.where(usable, length, 1.0), geometric[:, None])
+    if (np.einsum("mci,mi->mc", normals, geometric) > 1.0 - 1e-6).all():
+        return shape
+    return replace(shape, normals=normals.astype(np.float32))

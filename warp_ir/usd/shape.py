@@ -1,0 +1,97 @@
+"""A gprim as triangles in its own space, before it is coloured and placed in the world."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ir.scene import Floats, Ints
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Triangles that still know which face and which face-vertex of the prim they came from.
+
+    A native prototype is read into one `Shape`, however often it is placed.
+    """
+
+    points: Floats
+    """float64 [n, 3]."""
+    triangles: Ints
+    """int32 [m, 3], counter-clockwise seen from the front."""
+    face: Ints
+    """int32 [m]: the prim's face each triangle is part of."""
+    corner: Ints
+    """int32 [m, 3]: the prim's face-vertex each corner is."""
+    normals: Floats | None = None
+    """float32 [m, 3, 3], unit shading normals; None: faceted."""
+    elements: Mapping[str, int] = field(default_factory=dict)
+    """How many values a primvar has per interpolation; an interpolation that is missing cannot be honoured."""
+    degenerate: int = 0
+    """Number of faces without area that were left out."""
+
+    def keep(self, mask: Mask) -> "Shape":
+        """This shape with only the triangles that the mask [m] selects."""
+        normals = None if self.normals is None else self.normals[mask]
+        return replace(
+            self,
+            triangles=self.triangles[mask],
+            face=self.face[mask],
+            corner=self.corner[mask],
+            normals=normals,
+        )
+
+
+def cross_products(points: Floats, triangles: Ints) -> Floats:
+    """Twice the area of each triangle, as a vector along its geometric normal, float64 [m, 3]."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def without_slivers(shape: Shape) -> Shape:
+    """The shape without triangles that have no area (to float64, relative to their longest edge)."""
+    a, b, c = (shape.points[shape.triangles[:, k]] for k in range(3))
+    ab, ac, bc = b - a, c - a, c - b
+    longest = np.maximum(np.maximum(_squared(ab), _squared(ac)), _squared(bc))
+    fine = _squared(np.cross(ab, ac)) > (1e-10 * longest) ** 2
+    return shape if fine.all() else shape.keep(fine)
+
+
+def place(shape: Shape, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
+    """Copies of a shape in the world.
+
+    Args:
+        shape: Triangles in their own space.
+        matrices: world_from_shape, float64 [k, 4, 4]; mirrored, sheared or flat ones are fine.
+
+    Returns:
+        Points float64 [k n, 3], triangles int32 [k m, 3] and normals float32 [k m, 3, 3] or None, copy after copy.
+    """
+    copies, count = len(matrices), len(shape.points)
+    linear = matrices[:, :3, :3]
+    points = np.matmul(shape.points, linear.transpose(0, 2, 1)) + matrices[:, None, :3, 3]
+    offsets = (np.arange(copies) * count).astype(np.int32)
+    triangles = shape.triangles[None] + offsets[:, None, None]
+    # Rows of the cofactor matrix, det · M⁻ᵀ, are cross products of rows: no inverse, so flat matrices pass.
+    mirrored = np.linalg.det(linear) < 0.0
+    triangles[mirrored] = triangles[mirrored][:, :, ::-1]
+    normals: Floats | None = None
+    if shape.normals is not None:
+        r0, r1, r2 = linear[:, 0], linear[:, 1], linear[:, 2]
+        cofactor = np.stack([np.cross(r1, r2), np.cross(r2, r0), np.cross(r0, r1)], axis=1)
+        cofactor[mirrored] *= -1.0
+        cofactor /= np.maximum(np.abs(cofactor).max(axis=(1, 2), keepdims=True), 1e-300)
+        normals = shape.normals.reshape(-1, 3) @ cofactor.transpose(0, 2, 1).astype(np.float32)
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+        normals = normals.reshape(copies, -1, 3, 3)
+        normals[mirrored] = normals[mirrored][:, :, ::-1]
+        normals = normals.reshape(-1, 3, 3)
+    return points.reshape(-1, 3), triangles.reshape(-1, 3), normals
+
+
+def _squared(vectors: Floats) -> Floats:
+    squares: Floats = np.einsum("ij,ij->i", vectors, vectors)
+    return squares

@@ -1,0 +1,122 @@
+"""Typed attribute values: USD hands out whatever a file holds, whatever the schema says."""
+
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Tf, Usd, UsdShade
+
+from warp_ir.scene import Color, Floats, Ints
+from warp_ir.usd.report import Unreadable
+
+_AS_IS = tuple(getattr(Gf.ColorSpaceNames, n) for n in ("LinearRec709", "Data", "Raw", "Unknown", "Identity"))
+"""Colour spaces whose numbers are used as they are."""
+
+
+def raw(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
+    """The value as USD gives it, None where there is none or where USD itself fails to read it."""
+    if not attribute:
+        return None
+    try:
+        return attribute.Get(time)
+    except Tf.ErrorException:
+        return None
+
+
+def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats | None:
+    """An array of vectors, float64 [n, columns]; None where nothing is authored.
+
+    Raises:
+        Unreadable: The value is of another type.
+    """
+    value = raw(attribute, time)
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.ndim != 2 or array.shape[1] != columns or array.dtype.kind not in "fiu":
+        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of {columns} floats each")
+    return array.astype(np.float64)
+
+
+def ints(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int = 1) -> Ints | None:
+    """An array of integers, int64 [n] or [n, columns]; None where nothing is authored.
+
+    Raises:
+        Unreadable: The value is of another type.
+    """
+    value = raw(attribute, time)
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if columns > 1 and array.ndim == 1 and array.size % columns == 0:
+        array = array.reshape(-1, columns)  # int[] where the schema says int3[] or int4[] means the same
+    if array.shape[1:] != ((columns,) if columns > 1 else ()) or array.ndim == 0 or array.dtype.kind not in "iu":
+        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of integers")
+    return array.astype(np.int64)
+
+
+def number(attribute: Usd.Attribute, time: Usd.TimeCode, default: float) -> float:
+    """A finite number; the default where nothing is authored.
+
+    Raises:
+        Unreadable: The value is not a number, or not finite.
+    """
+    value = raw(attribute, time)
+    if value is None:
+        return default
+    if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
+        raise Unreadable(f"{attribute.GetName()} is {_short(value)}, not a finite number")
+    return float(value)  # type: ignore[arg-type]
+
+
+def flag(attribute: Usd.Attribute, time: Usd.TimeCode, default: bool = False) -> bool:
+    """A truth value; the default where it is absent or something else."""
+    value = raw(attribute, time)
+    return bool(value) if isinstance(value, bool | int) else default
+
+
+def text(attribute: Usd.Attribute, time: Usd.TimeCode, default: str = "") -> str:
+    """A token or string; the default where it is absent or something else."""
+    value = raw(attribute, time)
+    return value if isinstance(value, str) else default
+
+
+def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color:
+    """A linear Rec.709 colour; the default where nothing is authored.
+
+    Raises:
+        Unreadable: The value is not three finite numbers.
+    """
+    value = raw(attribute, time)
+    if value is None:
+        return default
+    array = np.asarray(value)
+    if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise Unreadable(f"{attribute.GetName()} is {_short(value)}, not a finite colour")
+    red, green, blue = to_linear_rec709(attribute, array.astype(np.float64).reshape(1, 3))[0].tolist()
+    return red, green, blue
+
+
+def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
+    """Colours [n, 3] of an attribute, taken from its colour space (its own, its prim's or an ancestor's)."""
+    name = Usd.ColorSpaceAPI.ComputeColorSpaceName(attribute, None)
+    if not name or name in _AS_IS:
+        return colors
+    if not Gf.ColorSpace.IsValid(name):
+        raise Unreadable(f"{attribute.GetName()} has the unknown colour space '{name}'")
+    target, source = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709), Gf.ColorSpace(name)
+    unique, where = np.unique(colors, axis=0, return_inverse=True)
+    converted = [target.Convert(source, Gf.Vec3f(*c)).GetRGB() for c in unique.tolist()]
+    return np.array(converted, dtype=np.float64).reshape(-1, 3)[where.reshape(-1)]
+
+
+def producer(shader_input: UsdShade.Input) -> Usd.Attribute | None:
+    """The attribute an input's value comes from, through the interfaces of node graphs and materials."""
+    if not shader_input:
+        return None
+    attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input)
+    return attributes[0] if attributes else None
+
+
+def _short(value: object) -> str:
+    words = " ".join(str(value).split())
+    return words if len(words) <= 40 else words[:37] + "…"

@@ -1,0 +1,187 @@
+"""The walk over a stage: which gprims and lights are drawn, and where; instances included."""
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
+
+from warp_ir.scene import Floats, InputError
+from warp_ir.usd import value
+from warp_ir.usd.implicit import IMPLICIT
+from warp_ir.usd.instancing import read_instancer
+from warp_ir.usd.light import LIGHTS
+from warp_ir.usd.report import Report, Unreadable
+
+_DEPTH = 16
+"""Deepest nesting of point instancers that is followed."""
+_COPIES = 50_000_000
+"""Most copies of one gprim: what exceeds it is a mistake in the file, not a scene."""
+
+_IDENTITY = Gf.Matrix4d(1.0)
+_SHAPES = {"Mesh", "TetMesh", *IMPLICIT}
+_DRAWN = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+# A prototype may live below an `over` or a `class`, which keeps it from being drawn where it stands.
+_PROTOTYPE = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A prim and the places where it is drawn."""
+
+    prim: Usd.Prim
+    matrices: Floats
+    """world_from_prim, float64 [k, 4, 4]."""
+    colors: Floats | None = None
+    """displayColor that an instancer gives to each copy, float64 [k, 3]; the prim's own is stronger."""
+
+
+@dataclass(eq=False)
+class Found:
+    """What is drawn."""
+
+    shapes: list[Site] = field(default_factory=list)
+    lights: list[Site] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class _Visit:
+    """A prim still to be visited, with what it inherits."""
+
+    prim: Usd.Prim
+    matrices: Floats
+    purpose: object | None
+    colors: Floats | None
+    instancers: tuple[Sdf.Path, ...]
+
+
+def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: Collection[str], report: Report) -> Found:
+    """Visit every prim once per instancer that draws it, and gather gprims and lights.
+
+    Invisible subtrees and gprims of other purposes are counted and left out.
+
+    Raises:
+        InputError: Nested instancers multiply beyond reason.
+    """
+    return _Walk(stage, time, purposes, report).run()
+
+
+class _Walk:
+    def __init__(self, stage: Usd.Stage, time: Usd.TimeCode, purposes: Collection[str], report: Report) -> None:
+        self._stage, self._time, self._purposes, self._report = stage, time, purposes, report
+        self._transforms = UsdGeom.XformCache(time)
+        self._found = Found()
+        self._unread: Counter[str] = Counter()
+
+    def run(self) -> Found:
+        root = _Visit(self._stage.GetPseudoRoot(), np.eye(4)[None], None, None, ())
+        pending = [root]
+        while pending:  # a stack of our own: hierarchies may be deeper than Python's
+            pending += reversed(self._visit(pending.pop()))
+        return self._found
+
+    def _visit(self, visit: _Visit) -> list[_Visit]:
+        """Gather one prim, and return what is below it."""
+        prim, report = visit.prim, self._report
+        matrices, purpose = visit.matrices, visit.purpose
+        name = "default"
+        if prim.IsA(UsdGeom.Imageable):
+            imageable = UsdGeom.Imageable(prim)
+            if value.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
+                report.stats["prims_invisible"] += 1
+                return []
+            info = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
+            name, purpose = info.purpose, info
+            matrices = self._placed(prim, matrices)
+        if prim.IsInstance():
+            report.stats["native_instances"] += 1
+        kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        site = Site(prim, matrices, visit.colors)
+        if kind == "PointInstancer":
+            return self._instances(visit, matrices, purpose)
+        if kind in _SHAPES:
+            if self._is_drawn(prim, name):
+                self._found.shapes.append(site)
+        elif kind in LIGHTS:
+            if self._is_drawn(prim, name):
+                self._add_light(site, visit)
+        elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
+            if self._is_drawn(prim, name):
+                report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
+        elif prim.HasAPI(UsdLux.LightAPI) or kind in ("PluginLight", "LightFilter", "PluginLightFilter"):
+            report.warn(prim.GetPath(), f"{kind} is not read yet: it emits nothing")
+        children = prim.GetFilteredChildren(_PROTOTYPE if visit.instancers else _DRAWN)
+        if children and "LODRootAPI" in prim.GetAppliedSchemas():
+            # Levels of detail exclude each other; who cannot choose shows the default one.
+            default = value.raw(prim.GetAttribute("lod:default:index"), self._time)
+            children = children[default if isinstance(default, int) and 0 <= default < len(children) else 0 :][:1]
+        return [_Visit(child, matrices, purpose, visit.colors, visit.instancers) for child in children]
+
+    def _placed(self, prim: Usd.Prim, parents: Floats) -> Floats:
+        """world_from_prim for each place of the prim's parent."""
+        try:
+            local, resets = self._transforms.GetLocalTransformation(prim)
+        except Tf.ErrorException:
+            self._report.warn(prim.GetPath(), "its transform cannot be read; the identity is used")
+            return parents
+        matrix = np.array(local).T
+        if not np.isfinite(matrix).all():
+            self._report.warn(prim.GetPath(), "its transform is NaN or infinite; the identity is used")
+            return parents
+        if resets:
+            return np.broadcast_to(matrix, parents.shape)
+        return parents if local == _IDENTITY else parents @ matrix
+
+    def _is_drawn(self, prim: Usd.Prim, purpose: str) -> bool:
+        """Whether a prim's purpose is wanted, and not hidden by VisibilityAPI."""
+        if purpose not in self._purposes:
+            self._report.stats["prims_other_purpose"] += 1
+            self._report.stats[f"prims_{purpose}"] += 1
+            return False
+        if purpose != UsdGeom.Tokens.default_:
+            effective = UsdGeom.Imageable(prim).ComputeEffectiveVisibility(purpose, self._time)
+            if effective == UsdGeom.Tokens.invisible:
+                self._report.stats["prims_invisible"] += 1
+                return False
+        return True
+
+    def _add_light(self, site: Site, visit: _Visit) -> None:
+        if visit.instancers:
+            self._report.warn(site.prim.GetPath(), "lights in the prototypes of a point instancer are not read yet")
+        else:
+            self._found.lights.append(site)
+
+    def _instances(self, visit: _Visit, matrices: Floats, purpose: object | None) -> list[_Visit]:
+        """The prototypes of a point instancer, each with all its places."""
+        prim, report = visit.prim, self._report
+        path = prim.GetPath()
+        if len(visit.instancers) >= _DEPTH:
+            report.warn(path, f"point instancers nested deeper than {_DEPTH} are not followed")
+            return []
+        try:
+            groups = read_instancer(prim, self._time, report)
+        except Unreadable as trouble:
+            report.warn(path, f"{trouble}; the instancer is skipped")
+            return []
+        below: list[_Visit] = []
+        for group in groups:
+            prototype = self._stage.GetPrimAtPath(group.prototype)
+            if not prototype:
+                report.warn(path, f"its prototype {group.prototype} does not exist")
+                continue
+            if any(used.HasPrefix(group.prototype) for used in (*visit.instancers, path)):
+                report.warn(path, f"its prototype {group.prototype} contains the instancer itself; left out")
+                continue
+            outer, inner = len(matrices), len(group.matrices)
+            if outer * inner > _COPIES:
+                raise InputError(f"{report.source}: {path}: nested instancers make {outer * inner} copies")
+            report.stats["point_instances"] += outer * inner
+            places = (matrices[:, None] @ group.matrices[None]).reshape(-1, 4, 4)
+            colors: Floats | None
+            if group.colors is not None:
+                colors = np.tile(group.colors, (outer, 1))
+            else:
+                colors = None if visit.colors is None else np.repeat(visit.colors, inner, axis=0)
+            below.append(_Visit(prototype, places, purpose, colors, (*visit.instancers, path)))
+        return below
