@@ -19,7 +19,7 @@ LAYERS = [
     ["profiling"],
     ["launch"],
     ["sampling"],
-    ["procedural", "usd"],
+    ["procedural", "usd", "bvh"],
     ["device_scene"],
     ["surface"],
     ["lights"],

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir import sampling
+from warp_ir.bvh import Bvh, build_bvh
 from warp_ir.launch import Launcher
 from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Projection, Scene
 
@@ -29,7 +30,7 @@ _TRIANGLE_EMITTER = len(LightKind)
 class SceneData:
     """Geometry, materials and emitters. Empty tables hold one unused row; the counts tell."""
 
-    mesh: wp.uint64  # every surface in one BVH; valid even if there is none
+    bvh: Bvh  # every surface; never empty
     triangle_count: int
     points: wp.array[wp.vec3]
     indices: wp.array[wp.int32]  # [3 m]
@@ -243,9 +244,9 @@ def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     data.points = launcher.array(points, wp.vec3)
     data.indices = launcher.array(indices.astype(np.int32), wp.int32)
     data.triangle_material = launcher.array(material.astype(np.int32), wp.int32)
-    owner = [k for k, m in enumerate(scene.meshes) for _ in range(min(len(m.triangles), 1))]
+    source = [k for k, m in enumerate(scene.meshes) if len(m.triangles)]
     counts = [len(m.triangles) for m in meshes]
-    data.triangle_mesh = launcher.array(np.repeat(owner, counts).astype(np.int32) if meshes else [-1], wp.int32)
+    data.triangle_mesh = launcher.array(np.repeat(source, counts).astype(np.int32) if meshes else [-1], wp.int32)
     data.emits_back = launcher.array(
         np.repeat([m.double_sided for m in meshes], counts).astype(np.int32) if meshes else [0], wp.int32
     )
@@ -253,9 +254,8 @@ def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     data.triangle_colors, data.corner_colors = _upload_corners([m.colors for m in meshes], counts, launcher)
     data.albedo = launcher.array([m.albedo for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
     data.emission = launcher.array([m.emission for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
-    mesh = wp.Mesh(data.points, data.indices, bvh_constructor="sah", bvh_leaf_size=2)
-    data.mesh = mesh.id
-    return mesh
+    data.bvh, owner = build_bvh(data.points, data.indices, launcher)
+    return owner
 
 
 def _upload_corners(corners: list[Any], counts: list[int], launcher: Launcher) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""Rays against surfaces: the only ray queries, and the only epsilon, of the whole renderer.
+"""Rays against surfaces, and the only epsilon of the whole renderer.
 
 Intersection points come from barycentric coordinates, which keeps their error within a few ulp of the
 triangle's own coordinates however far the ray has come (Wächter and Binder 2019). A ray therefore starts
@@ -8,6 +8,7 @@ a float can hold, at any scale.
 
 import warp as wp
 
+from warp_ir.bvh import intersect
 from warp_ir.device_scene import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -44,20 +45,19 @@ def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float)
     """The nearest surface along a ray."""
     hit = Hit()
     hit.triangle = -1
-    query = wp.mesh_query_ray(scene.mesh, origin, direction, t_max)
-    if query.result:
-        face = query.face
-        hit.triangle = face
-        hit.t = query.t
-        hit.u = query.u
-        hit.v = query.v
-        hit.front = wp.where(wp.dot(query.normal, direction) < 0.0, 1, 0)
-        hit.normal = wp.where(hit.front == 1, query.normal, -query.normal)
-        a = scene.points[scene.indices[3 * face]]
-        b = scene.points[scene.indices[3 * face + 1]]
-        c = scene.points[scene.indices[3 * face + 2]]
-        point = query.u * a + query.v * b + (1.0 - query.u - query.v) * c
-        hit.position = offset(scene, face, point, hit.normal)
+    found = intersect(scene.bvh, origin, direction, t_max, False)
+    if found.triangle >= 0:
+        hit.triangle = found.triangle
+        hit.t = found.t
+        hit.u = found.u
+        hit.v = found.v
+        hit.front = found.front
+        a = scene.points[scene.indices[3 * hit.triangle]]
+        b = scene.points[scene.indices[3 * hit.triangle + 1]]
+        c = scene.points[scene.indices[3 * hit.triangle + 2]]
+        n = wp.normalize(wp.cross(b - a, c - a))
+        hit.normal = wp.where(hit.front == 1, n, -n)
+        hit.position = offset(scene, hit.triangle, hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c, hit.normal)
     return hit
 
 
@@ -66,8 +66,8 @@ def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
     xyz = wp.vec3(target[0], target[1], target[2])
     if target[3] == 0.0:
-        return not wp.mesh_query_ray_anyhit(scene.mesh, origin, xyz, _INFINITY)
-    return not wp.mesh_query_ray_anyhit(scene.mesh, origin, xyz - origin, 0.999999)
+        return intersect(scene.bvh, origin, xyz, _INFINITY, True).triangle < 0
+    return intersect(scene.bvh, origin, xyz - origin, 0.999999, True).triangle < 0
 
 
 @wp.func

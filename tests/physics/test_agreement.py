@@ -61,9 +61,7 @@ def repeated(estimator, iterations, *, light_paths=64, seeds=16):
     Without edges because there the stratified jitter makes the true error smaller; and with G bounded, since next to
     another wall its square has no finite mean and no statement about errors can hold.
     """
-    common = dict(
-        width=8, height=8, light_paths=light_paths, absorption="roulette", bound_radius=0.3, max_bounces=max_bounces
-    )
+    common = dict(width=8, height=8, light_paths=light_paths, absorption="roulette", bound_radius=0.3)
     scene = furnace(0.6, shape="cube")
     films = [render(scene, estimator, iterations=iterations, seed=seed, **common) for seed in range(seeds)]
     return np.array([f.radiance() for f in films], np.float64), np.array([f.standard_error() for f in films])

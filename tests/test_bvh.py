@@ -1,0 +1,125 @@
+"""Rays find the triangles that are there, and none slips between two of them."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_ir.bvh import Bvh, build_bvh, intersect
+from warp_ir.procedural import cube, sphere
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _shoot(
+    first: int,
+    bvh: Bvh,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t: wp.array[wp.float32],
+    triangle: wp.array[wp.int32],
+    uv: wp.array[wp.vec2],
+    any_hit: wp.array[wp.int32],
+):
+    i = first + wp.tid()
+    hit = intersect(bvh, origins[i], directions[i], 3.0e38, False)
+    t[i] = hit.t
+    triangle[i] = hit.triangle
+    uv[i] = wp.vec2(hit.u, hit.v)
+    any_hit[i] = intersect(bvh, origins[i], directions[i], 3.0e38, True).triangle
+
+
+def shoot(launcher, points, triangles, origins, directions):
+    """t, triangle, uv and whether anything was hit, as NumPy arrays."""
+    bvh, _owner = build_bvh(launcher.array(points, wp.vec3), launcher.array(triangles.reshape(-1), wp.int32), launcher)
+    n = len(directions)
+    out = [launcher.empty(n, d) for d in (wp.float32, wp.int32, wp.vec2, wp.int32)]
+    origins = np.broadcast_to(origins, directions.shape)
+    launcher.launch(_shoot, n, [bvh, launcher.array(origins, wp.vec3), launcher.array(directions, wp.vec3), *out])
+    return [x.numpy() for x in out]
+
+
+def brute_force(points, triangles, origins, directions):
+    """The nearest t per ray in float64 (Möller and Trumbore 1997); infinity for a miss."""
+    a, b, c = (points[triangles[:, k]].astype(np.float64) for k in range(3))
+    best = np.full(len(directions), np.inf)
+    for i, (o, d) in enumerate(zip(np.broadcast_to(origins, directions.shape), directions, strict=True)):
+        p = np.cross(d, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1.0 / np.sum((b - a) * p, axis=1)
+            u = np.sum((o - a) * p, axis=1) * inverse
+            q = np.cross(o - a, b - a)
+            v = q @ d * inverse
+            t = np.sum((c - a) * q, axis=1) * inverse
+        hits = t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)]
+        best[i] = hits.min() if len(hits) else np.inf
+    return best
+
+
+def soup(count, seed=0):
+    """Random triangles in the unit cube."""
+    random = np.random.default_rng(seed)
+    corners = random.random((count, 1, 3)) + random.normal(size=(count, 3, 3)) * 0.05
+    return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 64, 65, 1000])
+def test_nearest_triangle_of_a_soup(launcher, count):
+    """The nearest hit is that of testing every triangle in double precision, and the barycentrics lead to it."""
+    points, triangles = soup(count)
+    random = np.random.default_rng(1)
+    origins = random.uniform(-0.5, 1.5, (500, 3)).astype(np.float32)
+    directions = (random.random((500, 3)) - origins).astype(np.float32)
+    t, triangle, uv, any_hit = shoot(launcher, points, triangles, origins, directions)
+    expected = brute_force(points, triangles, origins, directions)
+    hit = triangle >= 0
+    np.testing.assert_array_equal(hit, np.isfinite(expected))
+    np.testing.assert_array_equal(any_hit >= 0, hit)
+    np.testing.assert_allclose(t[hit], expected[hit], rtol=1e-4)
+    weights = np.column_stack([uv, 1.0 - uv.sum(axis=1)])[hit]
+    by_uv = np.einsum("nk,nkc->nc", weights, points[triangles[triangle[hit]]])
+    np.testing.assert_allclose(by_uv, origins[hit] + t[hit, None] * directions[hit], atol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.4, 1.0e3])
+@pytest.mark.parametrize("target", ["vertices", "edges", "random"])
+@pytest.mark.parametrize("shape", ["sphere", "cube"])
+def test_closed_meshes_are_watertight(launcher, shape, target, shift):
+    """No ray from inside a closed mesh escapes: not through a vertex, not through an edge, wherever the mesh lies."""
+    points, triangles = sphere(level=5) if shape == "sphere" else cube()
+    points = (points * 0.5 + shift).astype(np.float32)
+    origin = (np.array([0.03, 0.07, -0.05]) + shift).astype(np.float32)
+    random = np.random.default_rng(2)
+    if target == "vertices":
+        aims = points
+    elif target == "edges":
+        s = random.random((len(triangles), 3, 1)).astype(np.float32)
+        corners = points[triangles]
+        aims = (s * corners + (1 - s) * np.roll(corners, 1, axis=1)).reshape(-1, 3)
+    else:
+        aims = origin + random.normal(size=(20_000, 3)).astype(np.float32)
+    _, triangle, _, any_hit = shoot(launcher, points, triangles, origin, (aims - origin).astype(np.float32))
+    assert (triangle < 0).sum() == 0
+    assert (any_hit < 0).sum() == 0
+
+
+def test_axis_parallel_rays_in_the_plane_of_a_wall(launcher):
+    """Rays along an axis, with zeros in their direction and their origin on a box's plane, find what lies ahead."""
+    points, triangles = cube()
+    points = np.concatenate([points, points * 0.25]).astype(np.float32)
+    triangles = np.concatenate([triangles, triangles + 8])
+    origins = np.array([[-0.9, 0.25, 0.1], [-0.9, 0.0, 0.0], [0.0, 0.9, -0.1], [0.1, 0.1, 0.9]], np.float32)
+    directions = np.array([[1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float32)
+    t, _, _, _ = shoot(launcher, points, triangles, origins, directions)
+    np.testing.assert_allclose(t[1:], 0.65, rtol=1e-6)
+    assert t[0] in (pytest.approx(0.65), pytest.approx(1.9))
+
+
+def test_many_coincident_triangles(launcher):
+    """A thousand copies of one triangle, which no tree can part, are hit as one."""
+    points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
+    triangles = np.tile(np.array([[0, 1, 2]], np.int32), (1000, 1))
+    t, triangle, _, _ = shoot(
+        launcher, points, triangles, np.zeros(3), np.array([[0.2, 0.2, 1], [2, 2, 1]], np.float32)
+    )
+    assert t[0] == 1.0 and triangle[0] >= 0 and triangle[1] == -1

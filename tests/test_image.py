@@ -1,0 +1,234 @@
+"""Pictures on disk: what was written is what is read, whole or not at all."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from warp_ir import InputError, RenderSettings
+from warp_ir.image import AOV_CHANNELS, check_output, read_image, whole_file, write_image
+from warp_ir.tonemap import srgb_from_linear
+
+HEIGHT, WIDTH = 5, 7
+
+
+class FakeFilm:
+    """A film of known values, without a renderer."""
+
+    width, height = WIDTH, HEIGHT
+    iterations, seconds, interrupted, rejected = 3, 0.5, False, 0
+    settings = RenderSettings(width=WIDTH, height=HEIGHT)
+
+    def __init__(self):
+        rng = np.random.default_rng(3)
+        self.values = {"radiance": rng.random((HEIGHT, WIDTH, 3)).astype(np.float32)}
+        for name, channels in AOV_CHANNELS.items():
+            shape = (HEIGHT, WIDTH, 3)[: 3 if len(channels) == 3 else 2]
+            self.values[name] = rng.random(shape).astype(np.float32)
+        self.values["alpha"][:] = 1.0
+        self.values["prim_id"] = np.arange(-1, HEIGHT * WIDTH - 1, dtype=np.int32).reshape(HEIGHT, WIDTH) * 4099
+
+    def radiance(self):
+        return self.values["radiance"]
+
+    def aov(self, name):
+        return self.values[name]
+
+    def error(self):
+        return 0.25
+
+
+@pytest.fixture
+def film():
+    return FakeFilm()
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.pfm", "a.exr"])
+def test_linear_formats_keep_every_bit(tmp_path, film, name):
+    """float32 in, the same float32 out, row 0 at the top."""
+    assert write_image(tmp_path / name, film, half=False) == [tmp_path / name]
+    np.testing.assert_array_equal(read_image(tmp_path / name)[..., :3], film.radiance())
+
+
+def test_half_and_rgbe_keep_their_digits(tmp_path, film):
+    """Half floats round to 11 bits; Radiance's shared exponent to 8 bits of the largest channel."""
+    write_image(tmp_path / "a.exr", film)
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr")[..., :3], film.radiance(), rtol=2**-11)
+    write_image(tmp_path / "a.hdr", film)
+    error = np.abs(read_image(tmp_path / "a.hdr") - film.radiance())
+    # The mantissa of the largest channel m is at least 128: a unit of it is at most m / 128.
+    assert (error <= film.radiance().max(axis=-1, keepdims=True) / 128.0).all()
+
+
+def test_half_overflow_is_the_largest_half(tmp_path):
+    """What 16 bits cannot hold becomes ±65504, never infinity."""
+    write_image(tmp_path / "a.exr", np.full((2, 2, 3), [65519.9, 1e30, -np.inf], dtype=np.float32))
+    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [65504.0, 65504.0, -65504.0]
+
+
+def test_exr_layers(tmp_path, film):
+    """One file holds colour, alpha and all AOVs, and identifiers and distances keep their 32 bits."""
+    path = tmp_path / "a.exr"
+    assert write_image(path, film, aovs=tuple(AOV_CHANNELS)) == [path]
+    assert read_image(path).shape == (HEIGHT, WIDTH, 4)
+    for name, channels in AOV_CHANNELS.items():
+        stored = read_image(path, layer=name)
+        exact = name in ("position", "depth", "prim_id", "alpha")
+        wanted = film.aov(name).reshape(HEIGHT, WIDTH, len(channels))
+        np.testing.assert_allclose(stored, wanted, rtol=0.0 if exact else 2**-11, err_msg=name)
+
+
+def test_exr_attributes(tmp_path, film):
+    """Settings, statistics and what the caller adds are in the file; what is None is not."""
+    import OpenImageIO as oiio
+
+    write_image(tmp_path / "a.exr", film, metadata={"stage": "room.usda", "big": 2**40, "camera": None})
+    file = oiio.ImageInput.open(str(tmp_path / "a.exr"))
+    found = {a.name: a.value for a in file.spec().extra_attribs if a.name.startswith("warp_ir:")}
+    file.close()
+    assert found["warp_ir:width"] == WIDTH and found["warp_ir:iterations"] == 3
+    assert found["warp_ir:estimated_error"] == 0.25 and found["warp_ir:stage"] == "room.usda"
+    assert found["warp_ir:big"] == 2.0**40 and "warp_ir:camera" not in found
+
+
+def test_other_formats_put_aovs_beside(tmp_path, film):
+    """a.png and its AOVs are files of their own, and all are written."""
+    written = write_image(tmp_path / "a.png", film, aovs=("depth", "normal"))
+    assert [path.name for path in written] == ["a.png", "a.depth.png", "a.normal.png"]
+    assert [read_image(path).shape[2] for path in written] == [4, 1, 3]
+
+
+@pytest.mark.parametrize("aov", AOV_CHANNELS)
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".hdr", ".pfm", ".npy", ".exr"])
+def test_every_aov_in_every_format(tmp_path, film, aov, suffix):
+    """An AOV can be a picture of its own."""
+    (path,) = write_image(tmp_path / f"a{suffix}", film, aov=aov)
+    assert read_image(path).shape[:2] == (HEIGHT, WIDTH)
+
+
+def test_png_is_srgb(tmp_path, film):
+    """8-bit values are the sRGB encoding, rounded to the nearest."""
+    write_image(tmp_path / "a.png", film.radiance(), exposure=-1.0)
+    wanted = srgb_from_linear(film.radiance() / 2.0)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), wanted, atol=0.5 / 255.0 + 1e-6)
+
+
+def test_png_alpha_is_unassociated(tmp_path, film):
+    """A pixel half covered by a surface of radiance 1 is white with alpha 1/2; uncovered ones are clear."""
+    film.values["alpha"][0, 0], film.values["radiance"][0, 0] = 0.5, 0.5
+    film.values["alpha"][0, 1], film.values["radiance"][0, 1] = 0.0, 0.0
+    write_image(tmp_path / "a.png", film)
+    pixels = read_image(tmp_path / "a.png")
+    np.testing.assert_allclose(pixels[0, 0], [1.0, 1.0, 1.0, 0.5], atol=0.5 / 255.0 + 1e-6)
+    assert pixels[0, 1].tolist() == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_grey_arrays_and_alpha_arrays(tmp_path):
+    """[h, w] and [h, w, 4] are pictures, other shapes are not."""
+    for shape in ((4, 3), (4, 3, 1), (4, 3, 4)):
+        for suffix in (".png", ".exr", ".hdr"):
+            write_image(tmp_path / f"a{suffix}", np.ones(shape, dtype=np.float32))
+    with pytest.raises(InputError, match="no picture"):
+        write_image(tmp_path / "a.png", np.ones((4, 3, 2), dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.tiff", "unknown extension '.tiff'"),
+        ("a", "unknown extension ''"),
+        ("missing/a.png", "there is no folder"),
+        ("", "is a folder"),
+        ("file/a.png", "cannot be written: not a directory"),
+        ("n" * 300 + ".png", "cannot be written: file name too long"),
+        ("a\0.png", "null character"),
+    ],
+)
+def test_bad_paths_are_one_line(tmp_path, name, message):
+    """Before anything is rendered, one line says what is wrong with the output."""
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=message) as caught:
+        check_output(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert sorted(os.listdir(tmp_path)) == ["file"]
+
+
+def test_devices_and_folders_are_not_replaced(tmp_path):
+    """A rename would happily replace a device or a pipe by a picture."""
+    os.mkfifo(tmp_path / "a.png")
+    with pytest.raises(InputError, match="not a regular file"):
+        check_output(tmp_path / "a.png")
+
+
+def test_folder_is_made_on_request(tmp_path, film):
+    """`make_folder` creates what is missing."""
+    path = tmp_path / "x" / "y" / "a.png"
+    assert check_output(path, make_folder=True) == path
+    write_image(path, film)
+    assert os.listdir(path.parent) == ["a.png"]
+
+
+def test_failure_leaves_the_old_file(tmp_path):
+    """If writing fails half-way, the old picture is untouched and nothing else is left."""
+    path = tmp_path / "a.npy"
+    path.write_text("old")
+    with pytest.raises(InputError, match=r"a\.npy: cannot be written: no space left"), whole_file(path) as temporary:
+        temporary.write_text("half of the new")
+        raise OSError(28, "No space left on device")
+    assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.npy"]
+
+
+def test_links_are_followed(tmp_path, film):
+    """Writing to a symbolic link replaces what it points to."""
+    (tmp_path / "there").mkdir()
+    (tmp_path / "a.npy").symlink_to(tmp_path / "there" / "b.npy")
+    write_image(tmp_path / "a.npy", film)
+    assert (tmp_path / "a.npy").is_symlink() and (tmp_path / "there" / "b.npy").is_file()
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".npy", ".png"])
+def test_full_disk(tmp_path, suffix):
+    """When the system takes no more bytes, every format ends in an `InputError` and leaves no file."""
+    code = f"""
+import resource, numpy as np
+from warp_ir import InputError, write_image
+pixels = np.random.default_rng(1).random((200, 200, 3)).astype(np.float32)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
+try:
+    write_image({str(tmp_path / "a")!r} + {suffix!r}, pixels)
+except InputError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "cannot be written" in done.stdout and done.stdout.count("\n") == 1, done
+    assert os.listdir(tmp_path) == []
+
+
+def test_read_errors_are_one_line(tmp_path):
+    """A missing file, a file that is no picture, and a missing layer are named."""
+    (tmp_path / "text.png").write_text("no picture")
+    (tmp_path / "text.npy").write_text("no array")
+    for name in ("missing.exr", "missing.npy", "text.png", "text.npy"):
+        with pytest.raises(InputError, match=name) as caught:
+            read_image(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    write_image(tmp_path / "a.exr", np.ones((2, 2, 3), dtype=np.float32))
+    with pytest.raises(InputError, match="has no layer 'depth'"):
+        read_image(tmp_path / "a.exr", layer="depth")
+
+
+def test_arrays_have_no_aovs(tmp_path, film):
+    """AOVs of an array, and AOVs that nobody knows, are refused."""
+    with pytest.raises(InputError, match="no AOVs"):
+        write_image(tmp_path / "a.exr", np.ones((2, 2, 3)), aovs=("depth",))
+    with pytest.raises(InputError, match="no AOV 'beauty'"):
+        write_image(tmp_path / "a.exr", film, aovs=("beauty",))
+
+
+def test_names_are_the_films():
+    """The AOVs that can be written are those that a film has."""
+    from warp_ir import Film
+
+    assert set(AOV_CHANNELS) == set(Film.AOV_NAMES)
