@@ -1,0 +1,265 @@
+"""Make the reference pictures of `benchmarks/references/` with Mitsuba 3, a renderer that shares no code with ours.
+
+    python benchmarks/make_references.py [NAME ...] [--seconds S] [--variant llvm_ad_rgb] [--png FOLDER]
+
+Each scene is translated from the host `Scene` record to Mitsuba, and rendered in independent passes until its error
+target or its time is reached. An .npz of a picture holds `mean` and `standard_error` (float32 [height, width, 3],
+linear radiance), `floor` (its own relMSE, from the standard error) and the provenance as strings.
+
+The variant `llvm_ad_rgb` needs LLVM 16 or newer (Debian: libllvm19), found by itself or at DRJIT_LIBLLVM_PATH;
+without it the script falls back to `scalar_rgb`, which gives the same pictures more slowly.
+
+What had to be matched:
+
+* Our lights cast light, block no ray and are not seen. Here they are shapes with a `null` surface, through which
+  `volpath` lets both paths and shadow rays pass (`path` would be blocked), and `hide_emitters`.
+* Mitsuba has no DISTANT light with an angle: it becomes a disk so far away (1000 times the scene's extent) that it
+  fills the same cone; from place to place in the scene its direction then differs by at most 0.001 rad.
+* Shading normals count at every bounce there, and only for camera rays here: reference scenes are faceted, where
+  the two agree.
+* An emissive mesh emits from its front only, as here; one that is `double_sided` is refused.
+* Textures are what `load_usd` makes of them; `loader_warnings` in the .npz tells when that was their mean.
+* `thin_walls` has no picture: Mitsuba's shadow rays end a thousandth short of the light, so they skip a wall that
+  close to one, and its dark box measures 0.001 instead of 0.
+"""
+
+import argparse
+import ctypes.util
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import warp_ir as ir
+from warp_ir.scene import Camera, Light, LightKind, Mesh, Projection, Scene
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCES = Path(__file__).resolve().parent / "references"
+
+PICTURES = {
+    # name: (scene, width, height, max_bounces)
+    "cornell_box": ("cornell_box", 128, 128, None),
+    "cornell_box_direct": ("cornell_box", 128, 128, 0),
+    "corridor": ("corridor", 64, 64, None),
+    "crowded_room": ("crowded_room", 96, 96, None),
+    "furnace_cube": ("furnace_cube", 32, 32, None),
+    "light_types": ("light_types", 120, 80, None),
+    "thousand_lights": ("thousand_lights", 64, 64, None),
+    "two_rooms": ("two_rooms", 96, 72, None),
+}
+"""The pictures that are stored; every one is a scene of `scenes_usd/`."""
+
+TARGET_FLOOR = 1e-4
+"""relMSE of the reference itself at which it is good enough."""
+
+
+def use_mitsuba(variant: str = "llvm_ad_rgb"):
+    """Import Mitsuba with `variant`, or with `scalar_rgb` where LLVM is missing."""
+    if variant.startswith("llvm") and "DRJIT_LIBLLVM_PATH" not in os.environ:
+        found = [ctypes.util.find_library(f"LLVM-{version}") for version in range(22, 15, -1)]
+        if any(found):
+            os.environ["DRJIT_LIBLLVM_PATH"] = next(filter(None, found))
+        else:
+            print("LLVM 16 or newer not found: using scalar_rgb", file=sys.stderr)
+            variant = "scalar_rgb"
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    return mi
+
+
+def relative_mse_floor(mean: np.ndarray, standard_error: np.ndarray) -> float:
+    """Expected relMSE of a perfect picture against this reference."""
+    return float(np.mean(standard_error**2 / (mean**2 + 0.01 * mean.mean() ** 2)))
+
+
+def _rgb(color) -> dict:
+    """A reflectance or radiance as Mitsuba wants it."""
+    return {"type": "rgb", "value": [float(c) for c in color]}
+
+
+def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
+    """The triangles of `mesh` that have material `index`, as a Mitsuba mesh with unshared corners."""
+    chosen = mesh.material == index
+    material = scene.materials[index]
+    emissive = any(value > 0.0 for value in material.emission)
+    if emissive and mesh.double_sided:
+        raise NotImplementedError(f"{mesh.name}: emission from both sides of a mesh")
+    smooth = mesh.normals is not None and not emissive
+    coloured = mesh.colors is not None
+
+    properties = mi.Properties()
+    reflectance = {"type": "mesh_attribute", "name": "vertex_color"} if coloured else _rgb(material.albedo)
+    bsdf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
+    properties["bsdf"] = mi.load_dict(bsdf)
+    if emissive:
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(material.emission)})
+    properties["face_normals"] = not smooth
+
+    triangles = mesh.triangles[chosen]
+    result = mi.Mesh(mesh.name, triangles.size, len(triangles), has_vertex_normals=smooth, props=properties)
+    if coloured:
+        result.add_attribute("vertex_color", 3, mesh.colors[chosen].ravel().astype(np.float32))
+    parameters = mi.traverse(result)
+    parameters["vertex_positions"] = mesh.points[triangles].ravel().astype(np.float32)
+    parameters["faces"] = np.arange(triangles.size, dtype=np.uint32)
+    if smooth:
+        parameters["vertex_normals"] = mesh.normals[chosen].ravel().astype(np.float32)
+    parameters.update()
+    return result
+
+
+def _light(mi, light: Light, centre: np.ndarray, extent: float) -> dict:
+    """A Mitsuba emitter, or a shape with one that lets every ray pass."""
+    transform = mi.ScalarTransform4f
+    world = transform(light.world_from_light)
+    shape = {"emitter": {"type": "area", "radiance": _rgb(light.radiance)}, "surface": {"type": "null"}}
+    flip = transform().rotate([1, 0, 0], 180)  # Mitsuba's plane shapes emit along +Z
+    match light.kind:
+        case LightKind.RECT:
+            size = transform().scale([light.width / 2, light.height / 2, 1])
+            return {"type": "rectangle", "to_world": world @ flip @ size, **shape}
+        case LightKind.DISK:
+            size = transform().scale([light.radius, light.radius, 1])
+            return {"type": "disk", "to_world": world @ flip @ size, **shape}
+        case LightKind.SPHERE:
+            return {"type": "sphere", "to_world": world, "radius": light.radius, **shape}
+        case LightKind.CYLINDER:
+            ends = {"p0": [-light.length / 2, 0, 0], "p1": [light.length / 2, 0, 0]}
+            return {"type": "cylinder", "to_world": world, "radius": light.radius, **ends, **shape}
+        case LightKind.POINT:
+            position = light.world_from_light[:3, 3].tolist()
+            return {"type": "point", "position": position, "intensity": _rgb(light.radiance)}
+        case LightKind.DOME:
+            return {"type": "constant", "radiance": _rgb(light.radiance)}
+        case LightKind.DISTANT:
+            direction = -light.world_from_light[:3, 2] / np.linalg.norm(light.world_from_light[:3, 2])
+            if light.angle == 0.0:
+                return {"type": "directional", "direction": direction, "irradiance": _rgb(light.radiance)}
+            distance = 1000.0 * extent
+            radius = distance * np.tan(np.radians(light.angle / 2))
+            origin, side = centre - distance * direction, np.roll(direction, 1)
+            look = transform().look_at(origin=origin.tolist(), target=centre.tolist(), up=side.tolist())
+            return {"type": "disk", "to_world": look @ transform().scale([radius, radius, 1]), **shape}
+    raise NotImplementedError(light.kind)
+
+
+def _sensor(mi, camera: Camera, extent: float, width: int, height: int) -> dict:
+    """The camera, its film box-filtered like ours."""
+    left, right, bottom, top = camera.fit(width, height).window
+    mirror = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +Z with X to the left
+    to_world = mi.ScalarTransform4f(camera.world_from_camera @ mirror)
+    near, far = max(camera.clipping[0], 1e-5 * extent), min(camera.clipping[1], 1e3 * extent)
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    common = {"near_clip": near, "far_clip": far, "film": {**film, "pixel_format": "rgb"}}
+    if camera.projection is Projection.ORTHOGRAPHIC:
+        middle = mi.ScalarTransform4f().translate([-(left + right) / 2, (bottom + top) / 2, 0])
+        size = mi.ScalarTransform4f().scale([(right - left) / 2, (right - left) / 2, 1])
+        return {"type": "orthographic", "to_world": to_world @ middle @ size, **common}
+    return {
+        "type": "perspective",
+        "to_world": to_world,
+        "fov": float(np.degrees(2.0 * np.arctan((right - left) / 2))),
+        "fov_axis": "x",
+        "principal_point_offset_x": (left + right) / (2 * (right - left)),
+        "principal_point_offset_y": -(bottom + top) / (2 * (top - bottom)),
+        **common,
+    }
+
+
+def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = None):
+    """The same scene in Mitsuba, ready for `mitsuba.render`.
+
+    Args:
+        scene: What to translate.
+        width: Of the picture, in pixels.
+        height: Of the picture, in pixels.
+        max_bounces: As in `RenderSettings`: 0 is emission and direct light; None for no limit.
+    """
+    import mitsuba as mi
+
+    lower, upper = scene.bounds()
+    emissive = any(max(material.emission) > 0.0 for material in scene.materials)
+    if emissive and scene.lights:
+        raise NotImplementedError("lights that are hidden beside emissive surfaces that are seen")
+    depth = -1 if max_bounces is None else max_bounces + 2
+    result = {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": depth, "rr_depth": 6, "hide_emitters": not emissive},
+        "sensor": _sensor(mi, scene.camera, scene.extent, width, height),
+    }
+    for k, mesh in enumerate(scene.meshes):
+        for index in np.unique(mesh.material):
+            result[f"mesh_{k}_{index}"] = _mesh(mi, mesh, scene, int(index))
+    for k, light in enumerate(scene.lights):
+        result[f"light_{k}"] = _light(mi, light, (lower + upper) / 2, scene.extent)
+    return mi.load_dict(result)
+
+
+def render_reference(mi, scene: Scene, width: int, height: int, max_bounces: int | None, seconds: float) -> dict:
+    """Passes of independent seeds until `TARGET_FLOOR` or `seconds` is reached; the arrays and counts to store."""
+    translated = to_mitsuba(scene, width, height, max_bounces)
+    spp = max(4, 2**18 // (width * height) * 4)  # about a million paths a pass
+    passes, mean, squares = 0, 0.0, 0.0
+    start = time.perf_counter()
+    while True:
+        picture = np.array(mi.render(translated, spp=spp, seed=passes), dtype=np.float64) * scene.camera.exposure
+        passes += 1
+        delta = picture - mean
+        mean = mean + delta / passes
+        squares = squares + delta * (picture - mean)
+        if passes >= 8:
+            standard_error = np.sqrt(squares / (passes - 1) / passes)
+            floor = relative_mse_floor(mean, standard_error)
+            if floor <= TARGET_FLOOR or time.perf_counter() - start > seconds:
+                break
+    return {
+        "mean": mean.astype(np.float32),
+        "standard_error": standard_error.astype(np.float32),
+        "floor": floor,
+        "spp": spp * passes,
+        "passes": passes,
+    }
+
+
+def digest(stage: Path) -> str:
+    """SHA-256 of a scene file: tells whether a stored reference still belongs to it."""
+    return hashlib.sha256(stage.read_bytes()).hexdigest()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}; all by default")
+    parser.add_argument("--seconds", type=float, default=300.0, help="the most that one picture may take")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")
+    parser.add_argument("--png", type=Path, metavar="FOLDER", help="write tone-mapped pictures here as well")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(PICTURES):
+        parser.error(f"no such picture: {', '.join(sorted(unknown))}")
+    mi = use_mitsuba(arguments.variant)
+    REFERENCES.mkdir(exist_ok=True)
+    for name in arguments.names or PICTURES:
+        stem, width, height, max_bounces = PICTURES[name]
+        stage = ROOT / "scenes_usd" / f"{stem}.usda"
+        scene = ir.load_usd(stage)
+        result = render_reference(mi, scene, width, height, max_bounces, arguments.seconds)
+        provenance = {
+            "scene": stage.name,
+            "scene_sha256": digest(stage),
+            "max_bounces": "unlimited" if max_bounces is None else str(max_bounces),
+            "program": f"Mitsuba {mi.__version__} volpath, {mi.variant()}",
+            "command": f"python benchmarks/make_references.py {name} --seconds {arguments.seconds:g}",
+            "loader_warnings": "\n".join(scene.warnings),
+        }
+        np.savez_compressed(REFERENCES / f"{name}.npz", **result, **provenance)
+        print(f"{name}: {width}x{height}, {result['spp']} spp, floor {result['floor']:.2e}", flush=True)
+        if arguments.png is not None:
+            bitmap = mi.Bitmap(result["mean"]).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)
+            bitmap.write(str(arguments.png / f"{name}.png"))
+
+
+if __name__ == "__main__":
+    main()
