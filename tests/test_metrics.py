@@ -8,13 +8,13 @@ from warp_ir.metrics import mean_ratio, relative_mse, z_scores
 
 
 def test_relative_mse_of_a_constant():
-    """x = a·r for constant r: the error is (a − 1)² / 1.01."""
+    """For x = a·r with constant r: the error is (a − 1)² / 1.01."""
     reference = np.full((3, 5, 3), 7.0)
     assert relative_mse(1.1 * reference, reference) == pytest.approx(0.01 / 1.01)
 
 
 def test_relative_mse_of_black_pixels():
-    """r = (0, 2), x = r + d: with m = 1 the error is the mean of d²/0.01 and d²/4.01."""
+    """For r = (0, 2), x = r + d: with m = 1 the error is the mean of d²/0.01 and d²/4.01."""
     error = relative_mse(np.array([0.1, 2.1]), np.array([0.0, 2.0]))
     assert error == pytest.approx(0.5 * (0.01 / 0.01 + 0.01 / 4.01))
 

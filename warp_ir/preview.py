@@ -17,7 +17,7 @@ from warp_ir.scene import Camera, InputError, Projection, Scene
 _DECADES = 4.0
 """VPLs this many powers of ten below the strongest are drawn at the least brightness."""
 _POINT_SIZES = (14.0, 10.0, 7.0, 5.0, 4.0)
-"""Pixels of VPLs of bounce 0, 1, ...; the last stands for all others. At a picture 1000 pixels high."""
+"""Pixels of VPLs of bounce 0, 1, ...; the last stands for all others. For a picture 1000 pixels high; never below 3."""
 _BACKGROUND = "#16181d"
 
 
@@ -56,12 +56,12 @@ def picture_vpls(
     from vtkmodules.vtkCommonCore import vtkLogger
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    plotter = pyvista.Plotter(off_screen=True, window_size=(width, height), lighting="none")
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=[width, height], lighting="none")
     try:
         plotter.set_background(_BACKGROUND)
         camera = scene.camera.fit(width, height) if view == "camera" else _outside(scene, width / height)
         _add_meshes(plotter, scene, camera, open_front=view == "outside")
-        _add_points(plotter, vpls, height)
+        _add_points(plotter, vpls, camera, 0.01 * (scene.extent or 1.0), height)
         _aim(plotter, camera)
         with whole_file(path) as temporary:
             plotter.screenshot(str(temporary))
@@ -71,15 +71,15 @@ def picture_vpls(
 
 
 def _outside(scene: Scene, aspect: float) -> Camera:
-    """A camera that sees all of the scene, from the side of the scene's own camera and from above."""
+    """A camera that sees (nearly, at the corners) all of the scene, from beside and above its own camera."""
     lower, upper = scene.bounds()
     center, radius = 0.5 * (lower + upper), 0.5 * (scene.extent or 1.0)
     right, up, back = (scene.camera.world_from_camera[:3, k] for k in range(3))
     direction = back + 0.45 * right + 0.35 * up
     fov = 30.0
-    distance = 1.05 * radius / math.sin(math.radians(fov) / 2.0) / min(1.0, aspect)
+    distance = 0.9 * radius / math.sin(math.radians(fov) / 2.0) / min(1.0, aspect)
     eye = center + distance * direction / np.linalg.norm(direction)
-    return Camera.look_at(eye, center, up, fov=fov, aspect=aspect)
+    return Camera.look_at(eye.tolist(), center.tolist(), up.tolist(), fov=fov, aspect=aspect)
 
 
 def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool) -> None:
@@ -112,24 +112,29 @@ def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool)
             keep = np.einsum("nk,nk->n", outward, middle - center) < reach - 0.02 * span
         if not keep.any():
             continue
-        surface = pyvista.PolyData.from_regular_faces(mesh.points, mesh.triangles[keep])
+        triangles: Any = mesh.triangles[keep]
+        surface = pyvista.PolyData.from_regular_faces(mesh.points.astype(np.float64), triangles)
         surface.cell_data["shade"] = np.round(255.0 * shade[keep]).astype(np.uint8)
         plotter.add_mesh(surface, scalars="shade", rgb=True, lighting=False)
 
 
-def _add_points(plotter: Any, vpls: Any, height: int) -> None:
-    """A dot for each VPL that has a place."""
+def _add_points(plotter: Any, vpls: Any, camera: Camera, lift: float, height: int) -> None:
+    """A dot for each VPL that has a place, lifted by that much towards the camera, out of its surface."""
     import pyvista
 
     local = ~np.asarray(vpls.directional, dtype=bool)
     positions = np.asarray(vpls.positions)[local]
+    to_eye = camera.world_from_camera[:3, 3] - positions
+    if camera.projection == Projection.ORTHOGRAPHIC:
+        to_eye[:] = camera.world_from_camera[:3, 2]
+    positions = positions + lift * to_eye / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-300)[:, None]
     bounce = np.minimum(np.asarray(vpls.bounce)[local], len(_POINT_SIZES) - 1)
     colors = dot_colors(np.asarray(vpls.intensity)[local])
     for k, size in enumerate(_POINT_SIZES):
         if (bounce == k).any():
             cloud = pyvista.PolyData(np.ascontiguousarray(positions[bounce == k], dtype=np.float32))
             cloud.point_data["shine"] = colors[bounce == k]
-            size = max(1.0, size * height / 1000.0)
+            size = max(3.0, size * height / 1000.0)
             plotter.add_mesh(
                 cloud, scalars="shine", rgb=True, lighting=False, point_size=size, render_points_as_spheres=True
             )
@@ -151,7 +156,8 @@ def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
     with np.errstate(divide="ignore"):
         decades = np.log10(peak / strongest) if strongest > 0.0 else np.full(len(peak), -np.inf)
     brightness = 0.3 + 0.7 * np.clip(1.0 + decades / _DECADES, 0.0, 1.0)
-    return np.round(255.0 * brightness[:, None] * hue ** (1.0 / 2.2)).astype(np.uint8)
+    colors: npt.NDArray[np.uint8] = np.round(255.0 * brightness[:, None] * hue ** (1.0 / 2.2)).astype(np.uint8)
+    return colors
 
 
 def _aim(plotter: Any, camera: Camera) -> None:

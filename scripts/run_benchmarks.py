@@ -1,0 +1,53 @@
+"""Run all benchmarks on one device or several, and write tables, plots and numbers to `benchmarks/results/`.
+
+    python scripts/run_benchmarks.py --device cpu [--device cuda:0] [--quick]
+
+For each device: `<device>.json` (all numbers), `<device>.md` (the tables) and `<device>.png` (error against time).
+Leave the machine alone meanwhile.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+QUESTIONS = {"error": "run.py", "rays": "rays.py", "scaling": "scaling.py"}
+
+
+def run(device: str, results: Path, quick: bool) -> None:
+    """All questions on one device, each in a process of its own."""
+    stem = results / device.replace(":", "")
+    numbers, tables = {}, [f"# Benchmarks on {device}\n\n![error against time]({stem.name}.png)\n"]
+    with tempfile.TemporaryDirectory() as scratch:
+        for question, script in QUESTIONS.items():
+            json_file, markdown_file = Path(scratch, "numbers.json"), Path(scratch, "tables.md")
+            command = [sys.executable, BENCHMARKS / script, "--device", device]
+            command += ["--json", json_file, "--markdown", markdown_file]
+            if question == "error":
+                command += ["--plot", stem.with_suffix(".png"), *(["--quick"] if quick else ["--peers"])]
+            elif quick:
+                command += ["--quick"]
+            subprocess.run(command, check=True)
+            numbers[question] = json.loads(json_file.read_text())
+            tables.append(markdown_file.read_text())
+    stem.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n")
+    stem.with_suffix(".md").write_text("\n".join(tables))
+    print(f"wrote {stem}.json, .md and .png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--device", dest="devices", action="append", help="cpu, cuda:0, ...; may be repeated")
+    parser.add_argument("--results", type=Path, default=BENCHMARKS / "results", help="folder to write to")
+    parser.add_argument("--quick", action="store_true", help="a minute instead of a quarter of an hour; no peers")
+    options = parser.parse_args()
+    options.results.mkdir(parents=True, exist_ok=True)
+    for device in options.devices or ["cpu"]:
+        run(device, options.results, options.quick)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,492 @@
+"""The command line: what it writes, what it says, and how it ends."""
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warp_ir
+from warp_ir import RenderSettings
+from warp_ir.cli import main
+from warp_ir.cli.arguments import parse, settings_of
+from warp_ir.cli.console import ProgressDisplay, describe_progress, say_warnings
+from warp_ir.cli.frames import outputs_of
+from warp_ir.image import AOV_CHANNELS, read_image
+from warp_ir.scene import InputError
+
+ROOM = str(Path(__file__).parent.parent / "scenes_usd" / "cornell_box.usda")
+TURNTABLE = str(Path(__file__).parent.parent / "scenes_usd" / "turntable.usda")
+SMALL = ["--width", "8", "--iterations", "2", "--light-paths", "16", "--device", "cpu"]
+
+DARK = """#usda 1.0
+def Mesh "Quad" {
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+}
+def SphereLight "Light" {
+    float inputs:intensity = %s
+    double3 xformOp:translate = (0, 0, 2)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+
+
+def warp_ir_process(*args, **options):
+    """A `warp-ir` of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", "warp_ir", *args],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+    )  # fmt: skip
+
+
+def error_of(capsys, *args, code=2):
+    """The one line with which the command fails."""
+    assert main(list(args)) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert re.fullmatch(r"warp-ir: .*error: .+\n", captured.err), captured.err
+    return captured.err
+
+
+# ---- render ----------------------------------------------------------------------------------------------
+
+
+def test_render_writes_the_picture(tmp_path, capsys):
+    """Stage in, picture out, one line of summary, and no word on stderr."""
+    assert main(["render", ROOM, str(tmp_path / "a.exr"), *SMALL, "--aov", "depth", "normal"]) == 0
+    captured = capsys.readouterr()
+    assert read_image(tmp_path / "a.exr").shape == (8, 8, 4)
+    assert read_image(tmp_path / "a.exr", layer="normal").shape == (8, 8, 3)
+    assert re.fullmatch(r"\S+a\.exr: 8 x 8, 2 iterations in .* s on cpu, estimated error .* %\n", captured.out)
+    assert captured.err == "" and os.listdir(tmp_path) == ["a.exr"]
+
+
+def test_same_command_same_pixels(tmp_path):
+    """The command and the Python API give the same bits."""
+    assert main(["render", ROOM, str(tmp_path / "a.npy"), *SMALL, "--seed", "5", "-q"]) == 0
+    settings = RenderSettings(width=8, iterations=2, light_paths=16, seed=5)
+    film = warp_ir.render(warp_ir.load_usd(ROOM), settings, device="cpu")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.npy"), film.radiance())
+
+
+def test_quiet_says_nothing(tmp_path, capsys):
+    """--quiet leaves both streams alone."""
+    assert main(["render", ROOM, str(tmp_path / "a.png"), *SMALL, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_frames(tmp_path, capsys):
+    """Frames are files of their own, numbered by the placeholder, and they differ."""
+    output = str(tmp_path / "new" / "f.###.npy")
+    assert main(["render", TURNTABLE, output, *SMALL, "--frames", "1:7x6", "--make-output-path"]) == 0
+    assert sorted(os.listdir(tmp_path / "new")) == ["f.001.npy", "f.007.npy"]
+    first, second = (read_image(tmp_path / "new" / f"f.{n}.npy") for n in ("001", "007"))
+    assert not np.array_equal(first, second)
+
+
+def test_stats(tmp_path):
+    """--stats is strict JSON with timings, counts, memory, versions and settings."""
+    stats = tmp_path / "s.json"
+    assert main(["render", ROOM, str(tmp_path / "a.png"), *SMALL, "-q", "--stats", str(stats)]) == 0
+
+    def no_constants(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    found = json.loads(stats.read_text(), parse_constant=no_constants)
+    assert found["iterations"] == 2 and found["device"] == "cpu" and found["settings"]["light_paths"] == 16
+    assert {"import", "load", "compile", "upload", "write"} <= set(found["timings"])
+    assert found["loaded"]["triangles"] == 30 and found["counts"]["iterations"] == 2
+    assert found["peak_memory_bytes"] > 1 << 20 and found["versions"]["warp_ir"] == warp_ir.__version__
+    assert found["output"] == [str(tmp_path / "a.png")] and 0.0 < found["error"] < 10.0
+
+
+def test_stats_of_frames(tmp_path):
+    """With --frames the numbers of each frame are in a list; an error of one iteration is unknown: null."""
+    stats = tmp_path / "s.json"
+    command = ["render", TURNTABLE, str(tmp_path / "#.npy"), *SMALL, "--iterations", "1", "--frames", "1,2"]
+    assert main([*command, "-q", "--stats", str(stats)]) == 0
+    found = json.loads(stats.read_text())
+    assert [frame["frame"] for frame in found["frames"]] == [1.0, 2.0]
+    assert found["frames"][0]["error"] is None
+
+
+@pytest.mark.parametrize(("intensity", "what"), [("1e6", "bright"), ("1e-4", "dark")])
+def test_hint_of_exposure(tmp_path, capsys, intensity, what):
+    """A picture all white or black comes with the exposure that shows it; with that, without a hint."""
+    (tmp_path / "a.usda").write_text(DARK % intensity)
+    command = ["render", str(tmp_path / "a.usda"), str(tmp_path / "a.png"), *SMALL]
+    assert main(command) == 0
+    hint = re.search(rf"hint: the picture is very {what}; --exposure (\S+) would", capsys.readouterr().err)
+    assert hint
+    assert main([*command, "--exposure", hint[1]]) == 0
+    assert "hint" not in capsys.readouterr().err
+
+
+# ---- interruption ----------------------------------------------------------------------------------------
+
+
+TELLING = """
+import sys
+from warp_ir.cli import main, render
+
+class Display(render.ProgressDisplay):
+    def __call__(self, progress):
+        print("begun" if progress.iterations == 1 else "", file=sys.stderr, end="", flush=True)
+
+render.ProgressDisplay = Display
+sys.exit(main(sys.argv[1:]))
+"""
+"""A `warp-ir` that says when the first iteration is done."""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_leaves_a_picture(tmp_path, number):
+    """Ctrl-C and SIGTERM end in a finished picture of what there is and the shell's exit code for them."""
+    picture, stats = tmp_path / "a.exr", tmp_path / "s.json"
+    command = ["render", ROOM, picture, *SMALL[:2], *SMALL[4:], "--time-limit", "600", "--stats", stats]
+    process = subprocess.Popen(
+        [sys.executable, "-c", TELLING, *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr.read(5) == "begun"
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert err == "warp-ir: interrupted\n" and "iterations" in out
+    assert read_image(picture).shape == (8, 8, 4)
+    assert json.loads(stats.read_text())["interrupted"] is True
+    assert sorted(os.listdir(tmp_path)) == ["a.exr", "s.json"]
+    assert process.returncode == 128 + number
+
+
+class Interrupted:
+    """A film on which nothing was exposed."""
+
+    width = height = 4
+    iterations, seconds, interrupted, rejected = 0, 0.0, True, 0
+
+    def __init__(self):
+        self.timings, self.counts = {}, {}
+
+    def error(self):
+        return math.nan
+
+
+def test_interruption_before_the_first_iteration(tmp_path, monkeypatch, capsys):
+    """There is no picture yet: the old file stays, and the message says that nothing was written."""
+    (tmp_path / "a.png").write_text("old")
+    monkeypatch.setattr(warp_ir, "render", lambda *args, **kwargs: Interrupted())
+    assert main(["render", ROOM, str(tmp_path / "a.png"), "--device", "cpu"]) == 130
+    captured = capsys.readouterr()
+    assert captured.out == "" and "nothing written" in captured.err
+    assert (tmp_path / "a.png").read_text() == "old"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interruption_while_loading(tmp_path, monkeypatch, capsys, number, code):
+    """Outside of the renderer, too, both signals end the command in one line."""
+    monkeypatch.setattr(warp_ir, "load_usd", lambda *args, **kwargs: os.kill(os.getpid(), number))
+    assert main(["info", ROOM]) == code
+    assert capsys.readouterr().err in ("warp-ir: interrupted\n", "warp-ir: terminated\n")
+
+
+# ---- errors ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["paint"], "invalid choice: 'paint'"),
+        (["render", ROOM], "the following arguments are required: OUTPUT"),
+        (["render", ROOM, "a.gif"], "a.gif: unknown extension '.gif'"),
+        (["render", ROOM, "/nowhere/a.png"], "there is no folder '/nowhere'"),
+        (["render", ROOM, "a.png", "--width", "0"], "--width: must be a whole number of at least 1, is 0"),
+        (["render", ROOM, "a.png", "--width", "wide"], "--width/-w: invalid int value: 'wide'"),
+        (["render", ROOM, "a.png", "--width", "99999999", "--height", "9999999"], "--width: must be small enough"),
+        (["render", ROOM, "a.png", "--width", "1000000000"], "at most"),
+        (["render", ROOM, "a.png", "--time-limit", "nan"], "--time-limit: must be a positive number"),
+        (["render", ROOM, "a.png", "--estimator", "magic"], "--estimator: invalid choice: 'magic'"),
+        (["render", ROOM, "a.png", "--max-bounces", "-1"], "--max-bounces: must be a whole number"),
+        (["render", ROOM, "a.png", "--aov", "beauty"], "unknown 'beauty'; known are direct, indirect"),
+        (["render", ROOM, "a.png", "--exposure", "nan"], "not a number: 'nan'"),
+        (["render", ROOM, "a.png", "--device", "cuda:77"], "--device: 'cuda:77' is not available; available: cpu"),
+        (["render", ROOM, "a.png", "--device", ""], "--device: '' is not available"),
+        (["render", ROOM, "a.png", "--frames", "1:3"], "the output needs one placeholder"),
+        (["render", ROOM, "##/a.##.png", "--frames", "1:3"], "the output needs one placeholder"),
+        (["render", ROOM, "a.##.png", "--frames", "one"], "'one' is not understood"),
+        (["render", ROOM, "a.##.png", "--frames", "1:2x0.5"], "1.5 needs a placeholder with decimals"),
+        (["render", ROOM, "a.##.png", "--frames", "1:99999999"], "more than 1000000 frames"),
+        (["render", ROOM, "a.png", "--stats", "a.txt"], "a.txt: unknown extension '.txt'; known are .json"),
+        (["render", ROOM, "a.png", "--camera", "Nobody"], "Nobody"),
+        (["render", "missing.usda", "a.png"], "missing.usda: no such file"),
+        (["render", __file__, "a.png"], "cannot be opened as USD"),
+        (["info", "missing.usda"], "missing.usda: no such file"),
+        (["vpls", ROOM, "a.exr"], "unknown extension '.exr'; known are .png .usda .npz"),
+        (["vpls", ROOM, "a.npz", "--iteration", "-1"], "--iteration: must be at least 0"),
+        (["render", ROOM, "a.png", "--purposes", "final"], "unknown 'final'; known are default, render"),
+        (["render", ROOM, "a.png", "--wid", "8"], "unrecognized arguments: --wid 8"),
+    ],
+)
+def test_errors_are_one_line(capsys, tmp_path, monkeypatch, arguments, message):
+    """Exit code 2, one line that says what is wrong, nothing on stdout and no file."""
+    monkeypatch.chdir(tmp_path)
+    assert message in error_of(capsys, *arguments)
+    assert os.listdir(tmp_path) == []
+
+
+def test_strict(tmp_path, capsys):
+    """What is a warning is an error with --strict."""
+    (tmp_path / "a.usda").write_text('#usda 1.0\ndef Mesh "Empty" {}\n')
+    assert main(["info", str(tmp_path / "a.usda")]) == 0
+    assert "warning: /" in capsys.readouterr().err
+    error_of(capsys, "info", str(tmp_path / "a.usda"), "--strict")
+
+
+def test_internal_errors_are_one_line(capsys, monkeypatch):
+    """A bug is no traceback either, but a line that says how to get one."""
+
+    def broken(*args, **kwargs):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr(warp_ir, "load_usd", broken)
+    line = error_of(capsys, "info", ROOM, code=1)
+    assert line == "warp-ir: internal error: RuntimeError: two lines (--verbose shows where)\n"
+    assert main(["info", ROOM, "--verbose"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_out_of_memory_is_one_line(capsys, monkeypatch):
+    """So does memory that runs out."""
+
+    def hungry(*args, **kwargs):
+        raise MemoryError
+
+    monkeypatch.setattr(warp_ir, "load_usd", hungry)
+    assert "out of memory" in error_of(capsys, "info", ROOM, code=1)
+
+
+def test_native_libraries_keep_silent(tmp_path):
+    """In a process of its own, too, an error is one line: Warp and USD print none of theirs."""
+    process = warp_ir_process("render", ROOM, str(tmp_path / "a.png"), "--device", "cuda:77")
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err.count("\n")) == (2, "", 1), err
+
+
+def test_closed_pipe():
+    """`warp-ir info … | head -0` is no error worth a traceback."""
+    read, write = os.pipe()
+    os.close(read)
+    process = subprocess.run(
+        [sys.executable, "-m", "warp_ir", "info", ROOM], stdout=write, stderr=subprocess.PIPE, text=True, timeout=60
+    )
+    os.close(write)
+    assert process.stderr == "" and process.returncode == 128 + signal.SIGPIPE
+
+
+# ---- info and vpls ---------------------------------------------------------------------------------------
+
+
+def test_info_table(capsys):
+    """The table names the camera, the geometry, the light and the materials."""
+    assert main(["info", ROOM]) == 0
+    table = capsys.readouterr().out
+    for line in (r"camera +/World/main_cam, perspective", r"triangles +30", r"lights +rect +radiance \(", "up axis +Y"):
+        assert re.search(line, table), line
+
+
+def test_info_json(capsys):
+    """--json has the same as plain values."""
+    assert main(["info", ROOM, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["triangles"] == 30 and facts["camera"]["name"] == "/World/main_cam"
+    assert [light["kind"] for light in facts["lights"]] == ["rect"]
+    assert facts["cameras"] == ["/World/main_cam"] and facts["warnings"] == []
+
+
+def test_vpls_arrays_and_points(tmp_path, capsys):
+    """The .npz has the arrays, and the .usda the same points in the stage's axis and unit."""
+    from pxr import Usd, UsdGeom
+
+    for suffix in ("npz", "usda"):
+        command = ["vpls", ROOM, str(tmp_path / f"v.{suffix}"), "--light-paths", "32", "--device", "cpu"]
+        assert main(command) == 0
+        assert re.search(r"\d+ VPLs\n", capsys.readouterr().out)
+    arrays = np.load(tmp_path / "v.npz")
+    stage = Usd.Stage.Open(str(tmp_path / "v.usda"))
+    points = UsdGeom.Points(stage.GetDefaultPrim())
+    np.testing.assert_allclose(np.array(points.GetPointsAttr().Get()), arrays["positions"], rtol=1e-5, atol=1e-3)
+    intensity = UsdGeom.PrimvarsAPI(points).GetPrimvar("intensity").Get()
+    np.testing.assert_allclose(np.array(intensity), arrays["intensity"], rtol=1e-5)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == UsdGeom.GetStageMetersPerUnit(Usd.Stage.Open(ROOM))
+    assert len(points.GetWidthsAttr().Get()) == len(arrays["positions"]) >= 32
+
+
+def test_vpls_picture(tmp_path):
+    """The .png shows something: more than one colour."""
+    assert main(["vpls", ROOM, str(tmp_path / "v.png"), "--light-paths", "32", "-w", "64", "-q"]) == 0
+    assert len(np.unique(read_image(tmp_path / "v.png").reshape(-1, 3), axis=0)) > 10
+
+
+# ---- arguments -------------------------------------------------------------------------------------------
+
+
+def test_help_imports_nothing_heavy():
+    """--help is there at once: Warp, USD, pictures and drawing stay unloaded."""
+    code = """
+import sys
+from warp_ir.cli import main
+try:
+    main(["render", "--help"])
+except SystemExit as end:
+    heavy = {"warp", "pxr", "pyvista", "vtkmodules", "OpenImageIO", "rich"} & set(sys.modules)
+    sys.exit(f"imported {heavy}" if heavy else end.code)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "examples:" in done.stdout and "--estimator" in done.stdout
+
+
+@pytest.mark.parametrize("command", ["render", "info", "vpls"])
+def test_help_fits_a_terminal(command, capsys, monkeypatch):
+    """80 columns suffice."""
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
+def test_version(capsys):
+    """--version is the package's."""
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"warp-ir {warp_ir.__version__}\n"
+
+
+def test_every_setting_is_a_flag():
+    """A flag for each field of RenderSettings, and what is not given keeps the field's default."""
+    assert settings_of(parse(["render", "a.usda", "b.png"])) == RenderSettings()
+    values = {"width": 3, "height": 4, "iterations": 5, "time_limit": 1.5, "target_error": 0.5, "visible_lights": True}
+    flags = [f"--{name.replace('_', '-')}" for name in values]
+    words = [
+        w for flag, v in zip(flags, values.values(), strict=True) for w in ([flag] if v is True else [flag, str(v)])
+    ]
+    assert settings_of(parse(["render", "a.usda", "b.png", *words])) == RenderSettings(**values)
+    assert set(RenderSettings().to_dict()) <= set(vars(parse(["render", "a", "b", *_every_flag()])))
+
+
+def _every_flag():
+    words = []
+    for name, value in RenderSettings(height=1, iterations=1, time_limit=1.0, target_error=1.0).to_dict().items():
+        if name not in ("visible_lights",) and not isinstance(value, bool):
+            given = {None: "1"}.get(value, str(value))
+            given = "roulette" if name == "absorption" else given
+            words += [f"--{name.replace('_', '-')}", given]
+        elif isinstance(value, bool):
+            words.append(f"--{name.replace('_', '-')}")
+    return words
+
+
+def test_habits_of_usdrecord():
+    """The flags of usdrecord are understood."""
+    args = parse(["render", "-cam", "Door", "-w", "7", "-f", "1:2", "a.usda", "b.##.png"])
+    assert (args.camera, args.width, args.frames) == ("Door", 7, "1:2")
+    assert parse(["render", "a", "b", "--imageWidth", "9"]).width == 9
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a", "b", "--aov", "depth", "normal"],
+        ["--aov", "depth", "normal", "a", "b"],
+        ["a", "--aov", "depth,normal", "b"],
+        ["a", "b", "--aov", "depth", "--aov", "normal"],
+    ],
+)
+def test_aovs_in_every_order(words):
+    """A list of AOVs does not swallow what follows."""
+    args = parse(["render", *words])
+    assert (args.stage, args.output, args.aovs) == ("a", "b", ["depth", "normal"])
+
+
+def test_help_names_every_aov(capsys):
+    """The AOVs need not be guessed."""
+    with pytest.raises(SystemExit):
+        main(["render", "--help"])
+    text = capsys.readouterr().out
+    assert all(name in text for name in AOV_CHANNELS)
+
+
+# ---- frames, warnings, progress --------------------------------------------------------------------------
+
+
+def test_placeholders():
+    """The number fills the whole placeholder, decimals and sign included."""
+    assert outputs_of("a.####.png", "7,9:8", None) == {
+        7: Path("a.0007.png"),
+        9: Path("a.0009.png"),
+        8: Path("a.0008.png"),
+    }
+    assert list(outputs_of("###.##.png", "1:2x0.5", None).values()) == [
+        Path(f"00{x}.png") for x in ("1.00", "1.50", "2.00")
+    ]
+    assert outputs_of("#/a.png", "1000", None) == {1000: Path("1000/a.png")}
+    assert outputs_of("a#.png", None, 3.0) == {3.0: Path("a#.png")}
+    with pytest.raises(InputError):
+        outputs_of("a.png", "1", None)
+
+
+def test_many_warnings_are_cut(capsys):
+    """The first ten and how many more; the same one once; all if asked for, or if only one would be hidden."""
+    say_warnings([f"/Prim{i}: odd" for i in range(30)] * 2)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 11 and lines[-1] == "warp-ir: warning: ... and 20 more; --verbose shows all"
+    say_warnings([f"/Prim{i}: odd" for i in range(30)], everything=True)
+    assert len(capsys.readouterr().err.splitlines()) == 30
+    say_warnings([f"/Prim{i}: odd" for i in range(11)])
+    assert "/Prim10" in capsys.readouterr().err
+
+
+class Step:
+    """A `Progress`."""
+
+    def __init__(self, iterations, error=math.nan, left=math.nan, fraction=0.5):
+        self.iterations, self.seconds, self.error = iterations, 1.0, error
+        self.seconds_left, self.fraction = left, fraction
+
+
+def test_progress_in_words():
+    """What is unknown is left out."""
+    assert describe_progress(Step(1)) == "1 iterations"
+    assert describe_progress(Step(20, 0.0123, 61.5)) == "20 iterations, error 1.2 %, 1:02 left"
+    assert describe_progress(Step(20, 0.5, 3600.0)) == "20 iterations, error 50 %, 1:00:00 left"
+
+
+def test_progress_lines_become_rare(capsys, monkeypatch):
+    """Without a terminal: lines after 10 s, 20 s more, 40 s more, ...: an hour is 8 lines."""
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with ProgressDisplay("a.png") as display:
+        for second in range(3600):
+            now[0] = float(second)
+            display(Step(second))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 8 and lines[0] == "warp-ir: a.png: 50 %, 10 iterations"
+
+
+def test_progress_bar_on_a_terminal(capsys, monkeypatch):
+    """On a terminal it is a bar, gone in the end."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with ProgressDisplay("a.png") as display:
+        display(Step(3, 0.25, 7.0))
+    assert "a.png" in capsys.readouterr().err

@@ -1,0 +1,96 @@
+"""What a user meets first: the README's commands and programs, imports that cost nothing, the project's files."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import warp_ir
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def fresh(code):
+    """Standard output of a program in a new interpreter in which warnings are errors."""
+    command = [sys.executable, "-W", "error", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, timeout=60).stdout
+
+
+def test_version_is_the_same_everywhere():
+    """Package, metadata and changelog agree."""
+    assert f'version = "{warp_ir.__version__}"' in PROJECT.splitlines()
+    assert f"## [{warp_ir.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_readme_test_command_runs_in_ci():
+    """The CI script finds exactly one line to run, and it does the whole set-up."""
+    commands = [line for line in README.splitlines() if line.endswith("python -m pytest")]
+    assert len(commands) == 1 and commands[0].startswith("python3 -m venv .venv && .venv/bin/pip install ")
+    script = ROOT / ".ci" / "run"
+    assert "grep -m 1 'python -m pytest$' README.md" in script.read_text(encoding="utf-8")
+    assert os.access(script, os.X_OK)
+
+
+def test_readme_render_command_parses():
+    """The README's first command, and the others, are understood, and their scene exists."""
+    from warp_ir.cli.arguments import parse
+
+    commands = re.findall(r"warp-ir ((?:render|info|vpls) [^`#\n]+)", README)
+    assert len(commands) >= 8
+    for command in commands:
+        parse(command.split())
+    assert (ROOT / "scenes_usd" / "cornell_box.usda").is_file()
+
+
+def test_readme_links_lead_somewhere():
+    """Every relative link of the README is a file (the picture and ARCHITECTURE.md included)."""
+    missing = [to for to in re.findall(r"\]\((?!http)([^)#]+)\)", README) if not (ROOT / to).exists()]
+    assert missing == []
+
+
+def test_readme_programs_run(tmp_path, monkeypatch):
+    """The Python of the README does what it says."""
+    programs = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    assert len(programs) == 2
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes_usd").symlink_to(ROOT / "scenes_usd")
+    for program in programs:
+        program = program.replace("width=128, iterations=16", "width=8, iterations=2")
+        exec(compile(program, "README.md", "exec"), {})
+    assert (tmp_path / "cornell.exr").is_file()
+
+
+def test_import_is_light():
+    """`import warp_ir` imports neither Warp nor USD, nor anything that draws or reads pictures."""
+    heavy = "warp", "pxr", "pyvista", "vtk", "OpenImageIO", "rich", "matplotlib", "scipy"
+    code = f"import sys, warp_ir; print([name for name in {heavy} if name in sys.modules])"
+    assert fresh(code).strip() == "[]"
+
+
+def test_every_public_name_exists():
+    """All names that the package promises can be had, and unknown ones are an AttributeError."""
+    for name in warp_ir.__all__:
+        assert getattr(warp_ir, name) is not None
+    assert set(warp_ir.__all__) < set(dir(warp_ir))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = warp_ir.nothing
+
+
+def test_license_is_complete():
+    """The license that pyproject.toml names is there in full."""
+    text = (ROOT / "LICENSE").read_text(encoding="utf-8")
+    assert 'license = "Apache-2.0"' in PROJECT.splitlines()
+    assert "TERMS AND CONDITIONS FOR USE, REPRODUCTION, AND DISTRIBUTION" in text
+    assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_entry_point_is_the_command():
+    """`warp-ir` is `warp_ir.cli.main`."""
+    from warp_ir.cli import main
+
+    assert 'warp-ir = "warp_ir.cli:main"' in PROJECT.splitlines() and callable(main)

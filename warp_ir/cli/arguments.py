@@ -1,0 +1,252 @@
+"""The command line: what can be said, in the habits of `usdrecord`, and how `--help` explains it.
+
+The flags for `RenderSettings` are made from its fields: a new field is a new flag.
+"""
+
+import argparse
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Collection, Sequence
+from typing import Any, NoReturn
+
+from warp_ir import __version__
+from warp_ir.image import AOV_CHANNELS
+from warp_ir.scene import InputError
+from warp_ir.settings import RenderSettings
+from warp_ir.tonemap import TONEMAPS
+
+_FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
+_ONLY_PICTURES = {"iterations", "time_limit", "target_error", "visible_lights", "bound_radius"}
+"""Settings that the light paths alone do not depend on."""
+_SHORT = {"width": ("-w",)}
+_PURPOSES = ("default", "render", "proxy", "guide")
+
+_RENDER_NOTES = """\
+The output's extension chooses the format: .exr (colour, alpha, AOV layers,
+metadata), .hdr, .pfm and .npy hold linear radiance; .png and .jpg are
+tone-mapped. Ctrl-C writes the picture so far.
+
+examples:
+  # 64 iterations, 512 pixels wide
+  warp-ir render room.usda room.png
+  # until the estimated error is 1 %, with more layers
+  warp-ir render room.usda room.exr --target-error 0.01 --aov depth normal
+  # another camera, half a minute, three times as bright as the file says
+  warp-ir render room.usda room.png --camera Door --time-limit 30 --exposure 1.5
+  # an animation
+  warp-ir render shot.usd shots/####.png --frames 1001:1024 --make-output-path
+  # a second opinion: the same picture by path tracing
+  warp-ir render room.usda path.png --estimator path --iterations 256
+"""
+_VPLS_NOTES = """\
+examples:
+  # a picture of the cloud in the room
+  warp-ir vpls room.usda cloud.png
+  # points to look at in usdview
+  warp-ir vpls room.usda cloud.usda --light-paths 256
+  # NumPy arrays: positions, normals, intensity, bounce, directional
+  warp-ir vpls room.usda cloud.npz --iteration 3
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Errors become `InputError`: one line, and how to get help."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """The arguments; `command` names the module of this package that carries it out.
+
+    Raises:
+        InputError: They make no sense.
+    """
+    parser = _Parser(
+        prog="warp-ir",
+        description="Instant radiosity for USD scenes: diffuse global illumination on CPU and GPU.",
+        epilog="Try: warp-ir render STAGE picture.png; 'warp-ir COMMAND --help' tells all about a command.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"warp-ir {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, summary, notes, fill in (
+        ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
+        ("info", "show what is in a stage, what will be skipped, and why", "", _add_info),
+        ("vpls", "write the virtual point lights: as picture, USD points or arrays", _VPLS_NOTES, _add_vpls),
+    ):
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.",
+            epilog=notes,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        command.add_argument("stage", metavar="STAGE", help="USD file (.usd .usda .usdc .usdz)")
+        fill(command)
+        messages = command.add_argument_group("messages")
+        messages.add_argument("--quiet", "-q", action="store_true", help="say nothing but errors")
+        messages.add_argument("--verbose", action="store_true", help="show all warnings, and tracebacks")
+    return parser.parse_args(_joined_names(argv))
+
+
+def _joined_names(argv: Sequence[str]) -> list[str]:
+    """Makes ``--aov depth normal room.usda`` ``--aov depth,normal room.usda``: a list that knows its end."""
+    joined: list[str] = []
+    for word in argv:
+        listing = len(joined) > 1 and joined[-2] == "--aov"
+        if listing and word in AOV_CHANNELS:
+            joined[-1] += "," + word
+        else:
+            joined.append(word)
+    return joined
+
+
+def settings_of(args: argparse.Namespace) -> RenderSettings:
+    """The render settings that were given; the others have their defaults.
+
+    Raises:
+        InputError: A value is out of range; the message names the flag.
+    """
+    given = {name: value for name, value in vars(args).items() if name in _FIELDS}
+    try:
+        return RenderSettings(**given)
+    except InputError as error:
+        name, colon, rest = str(error).partition(":")
+        raise InputError(f"{_flag(name)}{colon}{rest}" if name in _FIELDS else str(error)) from error
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("output", metavar="OUTPUT", help="picture to write; ### stands for the frame")
+    picture = parser.add_argument_group("picture")
+    _add_settings(picture, _FIELDS)
+    # usdrecord's name, understood and not advertised.
+    hidden = argparse.SUPPRESS
+    picture.add_argument("--imageWidth", dest="width", type=int, default=hidden, help=hidden)
+    _add_stage(parser)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--aov",
+        dest="aovs",
+        action="extend",
+        type=_names(AOV_CHANNELS),
+        default=[],
+        metavar="NAME ...",
+        help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files beside it",
+    )
+    stops = "of .png and .jpg: each stop doubles the radiance (default: 0)"
+    output.add_argument("--exposure", type=_stops, default=0.0, metavar="STOPS", help=stops)
+    output.add_argument(
+        "--tonemap",
+        choices=TONEMAPS,
+        default=TONEMAPS[0],
+        help="of .png and .jpg: srgb clips highlights, filmic rolls them off (default: srgb)",
+    )
+    output.add_argument("--float", dest="half", action="store_false", help="store .exr with 32 bits, not 16")
+    output.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
+    output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory and versions")
+    _add_device(output)
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    _add_stage(parser, frames=False)
+    parser.add_argument("--json", action="store_true", help="for programs")
+
+
+def _add_vpls(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("output", metavar="OUTPUT", help=".png picture, .usda points, or .npz arrays")
+    cloud = parser.add_argument_group("light paths")
+    _add_settings(cloud, [name for name in _FIELDS if name not in _ONLY_PICTURES])
+    cloud.add_argument("--iteration", type=int, default=0, metavar="N", help="whose paths (default: 0)")
+    cloud.add_argument(
+        "--view", choices=("camera", "outside"), default="outside", help="of the picture (default: outside)"
+    )
+    cloud.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
+    _add_device(cloud)
+    _add_stage(parser, frames=False)
+
+
+def _add_settings(group: Any, names: Collection[str]) -> None:
+    """A flag for each of the settings; those that are not given stay out of the namespace."""
+    hints = typing.get_type_hints(RenderSettings)
+    for name in names:
+        field = _FIELDS[name]
+        doc = str(field.metadata["doc"]).replace("%", "%%")
+        # The one type of `int`, `int | None`, ...
+        kind = next(k for k in typing.get_args(hints[name]) or (hints[name],) if k is not types.NoneType)
+        options: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
+        if kind is bool:
+            options["action"] = argparse.BooleanOptionalAction if field.default else "store_true"
+        elif field.metadata.get("choices"):
+            options["choices"] = field.metadata["choices"]
+        else:
+            options |= {"type": kind, "metavar": {int: "N", float: "X"}.get(kind, "TEXT")}
+        if field.default is not None and kind is not bool:
+            doc += f" (default: {field.default:g})" if kind is float else f" (default: {field.default})"
+        group.add_argument(_flag(name), *_SHORT.get(name, ()), help=doc, **options)
+
+
+def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
+    group = parser.add_argument_group("stage")
+    group.add_argument("--camera", "-cam", metavar="NAME", help="path or name (default: the main camera)")
+    when = group.add_mutually_exclusive_group()
+    if frames:
+        spec = "101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"
+        when.add_argument("--frames", "-f", metavar="SPEC", help=spec)
+    when.add_argument("--time", type=_finite, metavar="CODE", help="time code (default: the stage's start)")
+    group.add_argument(
+        "--purposes",
+        type=_names(_PURPOSES),
+        default=["render"],
+        metavar="NAME[,NAME]",
+        help="what to draw beside purpose 'default': render, proxy, guide (default: render)",
+    )
+    group.add_argument(
+        "--default-light",
+        choices=("none", "dome"),
+        default="dome",
+        help="what lights a stage in which nothing emits (default: dome)",
+    )
+    group.add_argument("--strict", action="store_true", help="what is skipped or guessed is an error")
+
+
+def _add_device(group: Any) -> None:
+    devices = "cpu, cuda:0, ... (default: auto, the first GPU or else the CPU)"
+    group.add_argument("--device", default="auto", metavar="NAME", help=devices)
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _names(known: Collection[str]) -> Any:
+    """A type that takes names separated by commas."""
+
+    def names(text: str) -> list[str]:
+        found = [name.strip() for name in text.split(",") if name.strip()]
+        for name in found:
+            if name not in known:
+                raise argparse.ArgumentTypeError(f"unknown {name!r}; known are {', '.join(known)}")
+        return found
+
+    return names
+
+
+def _finite(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"not a number: {text!r}")
+    return value
+
+
+def _stops(text: str) -> float:
+    value = _finite(text)
+    if abs(value) > 1000.0:
+        raise argparse.ArgumentTypeError("must be within ±1000 stops")
+    return value

@@ -1,0 +1,30 @@
+"""Which device a command runs on."""
+
+from warp_ir.cli.console import muted_stderr
+from warp_ir.scene import InputError
+
+
+def open_device(name: str, *, verbose: bool = False) -> str:
+    """Starts Warp and returns the device's name.
+
+    Args:
+        name: "cpu", "cuda", "cuda:N", or "auto" for the first GPU or else the CPU.
+        verbose: Whether Warp may talk.
+
+    Raises:
+        InputError: There is no such device; the message names those that there are.
+    """
+    import warp as wp
+
+    # This process is ours: Warp reports through our messages, or not at all.
+    wp.config.log_level = wp.LOG_INFO if verbose else wp.LOG_ERROR
+    with muted_stderr(not verbose):
+        devices = [str(device) for device in wp.get_devices()]
+    gpus = [device for device in devices if device.startswith("cuda")]
+    if name in ("auto", "cuda"):
+        wanted = gpus[0] if gpus else "cpu" if name == "auto" else name
+    else:
+        wanted = name
+    if wanted not in devices:
+        raise InputError(f"--device: {name!r} is not available; available: {', '.join(devices)}")
+    return wanted

@@ -1,0 +1,53 @@
+"""Frame numbers, and the names of their files: `101:105` and `shot.####.png`, as usdrecord has them."""
+
+import re
+from pathlib import Path
+
+from warp_ir.scene import InputError
+
+_MAX_FRAMES = 1_000_000
+
+
+def outputs_of(output: str, frames: str | None, time: float | None) -> dict[float | None, Path]:
+    """Time code -> the file to write; the one key is `time` if no frames are asked for.
+
+    Args:
+        output: Path, with one placeholder (`###`, or `###.##` for fractions) if there are frames.
+        frames: `101`, `101:105`, `105:101`, `101:109x2`, `101:104x0.5`, or several with commas.
+        time: Time code of a single picture.
+
+    Raises:
+        InputError: The frames make no sense, or the placeholder is missing or too short for them.
+    """
+    if frames is None:
+        return {time: Path(output)}
+    placeholders = re.findall(r"#+(?:\.#+)?", output)
+    if len(placeholders) != 1:
+        raise InputError(f"--frames: the output needs one placeholder such as ### for the frame: {output}")
+    width, digits = len(placeholders[0]), len(placeholders[0].partition(".")[2])
+    outputs: dict[float | None, Path] = {}
+    for frame in _time_codes(frames):
+        if round(frame, digits) != frame:
+            raise InputError(f"--frames: {frame:g} needs a placeholder with decimals, ###.##: {output}")
+        outputs[frame] = Path(output.replace(placeholders[0], f"{frame:0{width}.{digits}f}"))
+    return outputs
+
+
+def _time_codes(spec: str) -> list[float]:
+    """The numbers of a frame specification, without repetitions."""
+    from pxr import Tf, UsdUtils
+
+    codes: dict[float, None] = {}
+    for part in spec.split(","):
+        try:
+            span = UsdUtils.TimeCodeRange.CreateFromFrameSpec(part.strip())
+            valid = span.IsValid()
+        except Tf.ErrorException:
+            valid = False
+        if not valid:
+            raise InputError(f"--frames: {part.strip()!r} is not understood; use 101, 101:105 or 101:109x2")
+        for code in span:
+            codes[code.GetValue()] = None
+            if len(codes) > _MAX_FRAMES:
+                raise InputError(f"--frames: more than {_MAX_FRAMES} frames: {spec}")
+    return list(codes)
