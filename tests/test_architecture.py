@@ -25,6 +25,8 @@ LAYERS = [
     ["lights"],
     ["gbuffer"],
     ["vpl", "film"],
+    ["gather", "filter"],
+    ["reconstruction"],
     ["image"],
     ["estimators"],
     ["renderer"],

@@ -9,7 +9,7 @@ import warp_ir as ir
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
 
-SETTINGS = ir.RenderSettings(width=12, height=8, light_paths=32, iterations=6)
+SETTINGS = ir.RenderSettings(width=12, height=8, light_paths=32, iterations=6, filter=False)
 
 
 def test_half_and_half_is_the_whole(device):

@@ -111,6 +111,8 @@ class DeviceScene:
     frame: DeviceFrame
     extent: float
     """Diagonal of the bounding box in the device's frame."""
+    area: float
+    """Area of all surfaces in the device's frame."""
     mean_albedo: float
     """Mean reflectivity ρ̄ of the surfaces."""
     max_albedo: float
@@ -149,6 +151,7 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
             data=data,
             frame=frame,
             extent=extent * scale if extent > 0.0 else 1.0,
+            area=scene.area() * scale**2,
             mean_albedo=scene.mean_albedo(),
             max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
             emits=data.emitter_count > 0,

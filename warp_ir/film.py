@@ -20,15 +20,17 @@ wp.set_module_options({"enable_backward": False})
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 """What `Film.aov` can give beside the radiance."""
 Image = npt.NDArray[Any]
+_RADIANCE = ("emission", "direct", "indirect")
 
 
 @wp.struct
 class FilmData:
     """Sums over iterations, one row per pixel."""
 
-    direct: wp.array[wp.vec3d]  # emission and light reflected once
+    emission: wp.array[wp.vec3d]
+    direct: wp.array[wp.vec3d]  # light reflected once
     indirect: wp.array[wp.vec3d]
-    squares: wp.array[wp.vec3d]  # of direct + indirect
+    squares: wp.array[wp.vec3d]  # of the sum of the three
     albedo: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
     position: wp.array[wp.vec3]
@@ -43,6 +45,11 @@ def _finite(v: wp.vec3) -> bool:
     return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
 
 
+@wp.func
+def _double(v: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
 @wp.kernel
 def _add(
     first: int,
@@ -55,14 +62,15 @@ def _add(
 ) -> None:
     """Adds one iteration's estimate of every pixel."""
     i = first + wp.tid()
-    d = direct[i] * exposure
-    m = indirect[i] * exposure
-    total = d + m
+    le = gbuffer.emission[i] * exposure
+    once = wp.cw_mul(gbuffer.albedo[i], direct[i]) * exposure
+    more = wp.cw_mul(gbuffer.albedo[i], indirect[i]) * exposure
+    total = le + once + more
     if _finite(total):
-        x = wp.vec3d(wp.float64(total[0]), wp.float64(total[1]), wp.float64(total[2]))
-        film.direct[i] += wp.vec3d(wp.float64(d[0]), wp.float64(d[1]), wp.float64(d[2]))
-        film.indirect[i] += wp.vec3d(wp.float64(m[0]), wp.float64(m[1]), wp.float64(m[2]))
-        film.squares[i] += wp.cw_mul(x, x)
+        film.emission[i] += _double(le)
+        film.direct[i] += _double(once)
+        film.indirect[i] += _double(more)
+        film.squares[i] += wp.cw_mul(_double(total), _double(total))
     else:
         film.rejected[i] += 1
     if is_first == 1:
@@ -95,11 +103,14 @@ class Film:
         """Seconds by phase."""
         self.counts: dict[str, int] = {}
         """Rays, VPLs, ... of all iterations."""
+        self.reconstruction: Any = None
+        """What filters the picture (a `Reconstruction`); None: the picture is the plain mean."""
+        self._resolved: tuple[int, Any] = (0, None)
         self._frame = frame
         self._launcher = launcher
         data = FilmData()
         pixels = width * height
-        for name in ("direct", "indirect", "squares"):
+        for name in ("emission", "direct", "indirect", "squares"):
             setattr(data, name, launcher.zeros(pixels, wp.vec3d))
         for name in ("albedo", "normal", "position"):
             setattr(data, name, launcher.zeros(pixels, wp.vec3))
@@ -109,12 +120,14 @@ class Film:
         self._data = data
 
     def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0) -> None:
-        """Adds one iteration: what the camera saw, and the radiance estimated for it."""
+        """Adds one iteration: what the camera saw, and the irradiance over π estimated for it."""
         self._launcher.launch(
             _add,
             self.width * self.height,
             [gbuffer, direct, indirect, exposure, int(self.iterations == 0), self._data],
         )
+        if self.reconstruction is not None:
+            self.reconstruction.observe(gbuffer, direct, indirect)
         self.iterations += 1
 
     def merge(self, other: "Film") -> None:
@@ -129,12 +142,26 @@ class Film:
             mine, theirs = getattr(self._data, name).numpy(), getattr(other._data, name).numpy()
             if name != "mesh" or self.iterations == 0:
                 getattr(self._data, name).assign(mine + theirs)
+        if self.reconstruction is not None and other.reconstruction is not None:
+            self.reconstruction.merge(other.reconstruction)
         self.iterations += other.iterations
         self.seconds += other.seconds
 
     def radiance(self) -> npt.NDArray[np.float32]:
-        """Mean radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top."""
-        return self._mean("direct", "indirect").astype(np.float32)
+        """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
+
+        The mean of the iterations, its noise filtered if the settings say so and there are at least two.
+        """
+        if self.reconstruction is not None and self.iterations > 1:
+            direct, indirect = self._reconstruct()
+            return np.asarray(direct + indirect)
+        return self._mean(*_RADIANCE).astype(np.float32)
+
+    def _reconstruct(self) -> npt.NDArray[np.float32]:
+        """Filtered direct and indirect radiance [2, height, width, 3], computed once per iteration."""
+        if self._resolved[0] != self.iterations:
+            self._resolved = (self.iterations, self.reconstruction.resolve(self._data, self.iterations))
+        return np.asarray(self._resolved[1])
 
     def standard_error(self) -> npt.NDArray[np.float32]:
         """Standard error of the mean, float32 [height, width, 3], from the spread of the iterations.
@@ -145,7 +172,7 @@ class Film:
         n = self.iterations
         if n < 2:
             return np.full((self.height, self.width, 3), np.inf, np.float32)
-        mean = self._mean("direct", "indirect")
+        mean = self._mean(*_RADIANCE)
         variance = np.maximum(self._mean("squares") - mean * mean, 0.0)
         return np.sqrt(variance / (n - 1)).astype(np.float32)
 
@@ -156,7 +183,7 @@ class Film:
         """
         if self.iterations < 2:
             return math.nan
-        mean = self.radiance().astype(np.float64)
+        mean = self._mean(*_RADIANCE)
         scale = mean**2 + 0.01 * mean.mean() ** 2
         squared = self.standard_error().astype(np.float64) ** 2
         return float(np.sqrt(np.mean(np.divide(squared, scale, out=np.zeros_like(squared), where=scale > 0.0))))
@@ -164,7 +191,7 @@ class Film:
     def aov(self, name: str) -> Image:
         """One of `AOV_NAMES`.
 
-        "direct" and "indirect" [h, w, 3] add up to the radiance. "albedo", "normal" (shading, unit), "position"
+        "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance. "albedo", "normal" (shading, unit), "position"
         (world) [h, w, 3] and "depth" (along the view, scene units) [h, w] are means over the surface samples of the
         pixel, 0 where there are none; "alpha" [h, w] is the covered share; "prim_id" int32 [h, w] the
         index into `Scene.meshes` that the first iteration saw, -1 for the background.
@@ -173,8 +200,12 @@ class Film:
             InputError: There is no such AOV.
         """
         shape = (self.height, self.width)
-        if name in ("direct", "indirect"):
-            return self._mean(name).astype(np.float32)
+        if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 1:
+            return self._reconstruct()[("direct", "indirect").index(name)]
+        if name == "direct":
+            return self._mean("emission", "direct").astype(np.float32)
+        if name == "indirect":
+            return self._mean("indirect").astype(np.float32)
         if name == "prim_id":
             return self._data.mesh.numpy().reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
         hits = self._data.hits.numpy().reshape(shape)

@@ -56,41 +56,62 @@ def camera_ray(camera: CameraData, x: float, y: float) -> Ray:
     return ray
 
 
-@wp.kernel
-def _trace_primary(
-    first: int,
-    scene: SceneData,
-    camera: CameraData,
-    iteration: int,
-    seed: wp.uint32,
-    gbuffer: GBuffer,
-) -> None:
-    """One camera ray and what it meets."""
-    pixel = first + wp.tid()
-    scramble = sampling.hash_combine(sampling.hash_combine(seed, wp.uint32(pixel)), _JITTER)
-    jitter = sampling.sample_2d(scene.sobol, iteration, 0, scramble)
-    x = (float(pixel % camera.columns) + jitter[0]) / float(camera.columns)
-    y = (float(pixel // camera.columns) + jitter[1]) / float(camera.rows)
-    ray = camera_ray(camera, x, y)
+@wp.struct
+class Sight:
+    """What a camera ray meets; `mesh` is -1 for the background."""
+
+    mesh: int
+    position: wp.vec3
+    normal: wp.vec3
+    shading_normal: wp.vec3
+    albedo: wp.vec3
+    emission: wp.vec3
+    depth: float
+
+
+@wp.func
+def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
+    """Follows a camera ray."""
     origin = ray.origin + ray.direction * camera.near
     reach = camera.far - camera.near
     hit = closest(scene, origin, ray.direction, reach)
-
-    emitted = wp.vec3(0.0)
-    gbuffer.mesh[pixel] = -1
+    sight = Sight()
+    sight.mesh = -1
     if hit.triangle >= 0:
-        gbuffer.mesh[pixel] = scene.triangle_mesh[hit.triangle]
-        gbuffer.position[pixel] = hit.position
-        gbuffer.normal[pixel] = hit.normal
-        gbuffer.shading_normal[pixel] = shading_normal(scene, hit)
-        gbuffer.albedo[pixel] = albedo(scene, hit)
-        gbuffer.depth[pixel] = hit.t + camera.near
-        emitted = emission(scene, hit)
+        sight.mesh = scene.triangle_mesh[hit.triangle]
+        sight.position = hit.position
+        sight.normal = hit.normal
+        sight.shading_normal = shading_normal(scene, hit)
+        sight.albedo = albedo(scene, hit)
+        sight.emission = emission(scene, hit)
+        sight.depth = hit.t + camera.near
         reach = hit.t
     if camera.shows_lights == 1:
         length = wp.length(ray.direction)
-        emitted += lights_along(scene, origin, ray.direction / length, reach * length, hit.triangle < 0, -1.0)
-    gbuffer.emission[pixel] = emitted
+        sight.emission += lights_along(scene, origin, ray.direction / length, reach * length, sight.mesh < 0, -1.0)
+    return sight
+
+
+@wp.kernel
+def _trace_primary(
+    first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
+) -> None:
+    """One camera ray and what it meets."""
+    pixel = first + wp.tid()
+    jitter = wp.vec2(0.5, 0.5)
+    if iteration >= 0:
+        scramble = sampling.hash_combine(sampling.hash_combine(seed, wp.uint32(pixel)), _JITTER)
+        jitter = sampling.sample_2d(scene.sobol, iteration, 0, scramble)
+    x = (float(pixel % camera.columns) + jitter[0]) / float(camera.columns)
+    y = (float(pixel // camera.columns) + jitter[1]) / float(camera.rows)
+    sight = see(scene, camera, camera_ray(camera, x, y))
+    gbuffer.mesh[pixel] = sight.mesh
+    gbuffer.position[pixel] = sight.position
+    gbuffer.normal[pixel] = sight.normal
+    gbuffer.shading_normal[pixel] = sight.shading_normal
+    gbuffer.albedo[pixel] = sight.albedo
+    gbuffer.emission[pixel] = sight.emission
+    gbuffer.depth[pixel] = sight.depth
 
 
 def new_gbuffer(launcher: Launcher, pixels: int) -> Any:
@@ -112,7 +133,7 @@ def trace_primary(
     iteration: int,
     seed: int,
 ) -> None:
-    """Fills the G-buffer with what the camera sees in one iteration."""
+    """Fills the G-buffer with what the camera sees in one iteration; in iteration -1 through the pixels' centres."""
     pixels = camera.columns * camera.rows
     launcher.launch(_trace_primary, pixels, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
     launcher.profile.counts["primary_rays"] += pixels

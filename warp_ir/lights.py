@@ -245,7 +245,7 @@ def lights_along(
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
         shape = int(0)
-        while wp.bvh_query_next(query, shape):
+        while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
             hit = _hit_shape(scene, light, origin, direction)
             if hit[3] > 0.0 and hit[3] < t_max:
@@ -264,6 +264,29 @@ def lights_along(
             if kind == _DOME or (kind == _DISTANT and 0.5 * wp.dot(apart, apart) < cone):
                 density = _probability(scene, scene.light_emitter[light]) / (2.0 * wp.pi * cone)
                 total += scene.light_radiance[light] * _weight(bsdf_density, density)
+    return total
+
+
+@wp.func
+def lights_beyond(
+    scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, cosine: float, bound: float
+) -> wp.vec3:
+    """Radiance of the lights that a unit direction meets before t_max, times the share (1 - bound/G)⁺ that a bound cuts.
+
+    `cosine` is that of the direction at the origin.
+    """
+    total = wp.vec3(0.0)
+    if scene.shape_count > 0:
+        query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
+        shape = int(0)
+        while wp.bvh_query_next(query, shape, t_max):
+            light = scene.shape_light[shape]
+            hit = _hit_shape(scene, light, origin, direction)
+            if hit[3] > 0.0 and hit[3] < t_max:
+                world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
+                g = -wp.dot(world_n, direction) * cosine / (hit[3] * hit[3])
+                if g > bound:
+                    total += scene.light_radiance[light] * (1.0 - bound / g)
     return total
 
 

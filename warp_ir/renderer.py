@@ -25,14 +25,19 @@ import warp as wp
 
 import warp_ir.estimators.keller
 import warp_ir.estimators.path
+import warp_ir.estimators.vpl
 import warp_ir.film
+import warp_ir.filter
+import warp_ir.gather
 import warp_ir.gbuffer
+import warp_ir.reconstruction
 import warp_ir.vpl
 from warp_ir.device_scene import camera_data, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
+from warp_ir.reconstruction import Reconstruction
 from warp_ir.sampling import iteration_scramble
 from warp_ir.scene import Scene
 from warp_ir.settings import RenderSettings
@@ -76,10 +81,10 @@ class Renderer:
         self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
         self.scene = upload_scene(scene, self.launcher)
         self._exposure = scene.camera.exposure
-        camera = camera_data(
+        self._camera = camera_data(
             scene.camera, self.scene.frame, settings.width, height, visible_lights=settings.visible_lights
         )
-        self._estimator = ESTIMATORS[settings.estimator](self.scene, camera, self.settings, self.launcher)
+        self._estimator = ESTIMATORS[settings.estimator](self.scene, self._camera, self.settings, self.launcher)
         pixels = settings.width * height
         self._gbuffer = new_gbuffer(self.launcher, pixels)
         self._direct = self.launcher.empty(pixels, wp.vec3)
@@ -90,6 +95,8 @@ class Renderer:
         assert self.settings.height is not None
         film = Film(self.settings.width, self.settings.height, self.launcher, self.scene.frame)
         film.settings = self.settings
+        if self.settings.filter and self.settings.estimator == "vpl":
+            film.reconstruction = Reconstruction(self.scene, self._camera, self.launcher, self._gbuffer, self._exposure)
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
@@ -140,6 +147,9 @@ def render(
                 progress(report)
             if report.fraction >= 1.0:
                 break
+    start = time.perf_counter()
+    film.radiance()
+    film.seconds += time.perf_counter() - start
     film.timings = renderer.launcher.profile.seconds()
     film.counts = {"iterations": film.iterations, **renderer.launcher.profile.counts}
     return film
@@ -171,6 +181,8 @@ def trace_vpls(
 
 
 def _modules(estimator: str) -> list[Any]:
+    if estimator == "vpl":
+        return [warp_ir.vpl, warp_ir.gather, warp_ir.estimators.vpl, warp_ir.filter, warp_ir.reconstruction]
     if estimator == "keller":
         return [warp_ir.vpl, warp_ir.estimators.keller]
     return [warp_ir.estimators.path]

@@ -194,14 +194,23 @@ class Scene:
         lower, upper = self.bounds()
         return float(np.linalg.norm(upper - lower))
 
+    def area(self) -> float:
+        """Area of all surfaces, one side each, in square scene units."""
+        return float(sum(_areas(mesh).sum() for mesh in self.meshes))
+
     def mean_albedo(self) -> float:
         """Mean reflectivity ρ̄ of the surfaces, weighted by area, averaged over the channels (Keller 1997)."""
         albedo = np.array([m.albedo for m in self.materials], dtype=np.float64).reshape(-1, 3).mean(axis=1)
         total, reflected = 0.0, 0.0
         for mesh in self.meshes:
-            a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
-            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            area = _areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
             total += float(area.sum())
             reflected += float(area @ rho)
         return reflected / total if total > 0.0 else 0.0
+
+
+def _areas(mesh: Mesh) -> Floats:
+    """Areas of a mesh's triangles, float64 [m]."""
+    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))

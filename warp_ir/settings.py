@@ -7,7 +7,7 @@ from typing import Any
 
 from warp_ir.scene import InputError
 
-ESTIMATOR_NAMES = ("keller", "path")
+ESTIMATOR_NAMES = ("vpl", "keller", "path")
 """In the order in which help texts list them; the first is the default."""
 ABSORPTION_NAMES = ("roulette", "fractional")
 MAX_PIXELS = 1 << 28
@@ -43,6 +43,7 @@ class RenderSettings:
         "keller only: bound the geometry term at 1/(R·extent)², R being this fraction of the scene's extent;"
         " darkens corners; 0 = unbounded",
     )
+    filter: bool = _setting(True, "vpl only: filter the noise that is left; off, the picture is the unbiased mean")
     visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
     seed: int = _setting(0, "seed of the random scrambling; the same seed gives the same bits")
 

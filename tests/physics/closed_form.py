@@ -8,6 +8,16 @@ import warp_ir as ir
 from warp_ir.scene import LightKind
 
 
+ITERATIONS = {"vpl": 64, "keller": 16, "path": 512}
+"""Enough of each estimator for a standard error of about a percent in the scenes of these tests."""
+
+
+def render(scene, estimator, device="cpu", **settings):
+    """A small, unfiltered picture."""
+    defaults = dict(width=8, height=8, iterations=ITERATIONS[estimator], light_paths=256, filter=False)
+    return ir.render(scene, ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
+
+
 def assert_mean(film, expected, *, bias=0.0, sigmas=5.0):
     """The picture's mean is `expected` within its own standard error.
 

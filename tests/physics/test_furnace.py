@@ -3,18 +3,12 @@
 import numpy as np
 import pytest
 
-import warp_ir as ir
-from tests.physics.closed_form import assert_mean
+from tests.physics.closed_form import assert_mean, render
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import furnace
 from warp_ir.vpl import survivors
 
 PATHS = 256
-
-
-def render(scene, estimator, device, **settings):
-    defaults = dict(width=8, height=8, iterations=16 if estimator == "keller" else 512, light_paths=PATHS)
-    return ir.render(scene, ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
 
 
 def truncation(albedo, paths=PATHS):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, rotation_x
+from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import floor
 from warp_ir.scene import LightKind
@@ -16,9 +16,8 @@ STRETCH = np.diag([2.0, 1.0, 0.5])
 SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
 
 
-def render(light, estimator, device, **settings):
-    defaults = dict(width=8, height=8, iterations=16 if estimator == "keller" else 256, max_bounces=0)
-    return ir.render(floor(light), ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
+def over_floor(light, estimator, device):
+    return render(floor(light), estimator, device, max_bounces=0, light_paths=1024)
 
 
 def light(kind, linear, **dimensions):
@@ -43,7 +42,7 @@ SHAPES = [
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.kind.name)
 def test_shapes_with_an_area(shape, estimator, device):
     """L = E/π under rectangles, ellipses, ellipsoids and elliptic cylinders, scaled, sheared and mirrored."""
-    assert_mean(render(shape, estimator, device), irradiance_at_origin(shape) / math.pi, bias=1.0e-4)
+    assert_mean(over_floor(shape, estimator, device), irradiance_at_origin(shape) / math.pi, bias=1.0e-4)
 
 
 def test_quadrature_knows_the_textbook():
@@ -64,13 +63,13 @@ def test_distant(estimator, angle, tilt, device):
         pytest.skip("part of the cone is below the horizon")
     solid = math.pi * math.sin(math.radians(angle / 2.0)) ** 2 if angle > 0.0 else 1.0
     expected = 2.0 * solid * math.cos(math.radians(tilt)) / math.pi
-    assert_mean(render(sun, estimator, device), expected, bias=1.0e-4)
+    assert_mean(over_floor(sun, estimator, device), expected, bias=1.0e-4)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_dome(estimator, device):
     """Under an open uniform sky of radiance L a white floor has radiance L."""
-    assert_mean(render(ir.Light("sky", LightKind.DOME, (0.7,) * 3), estimator, device), 0.7)
+    assert_mean(over_floor(ir.Light("sky", LightKind.DOME, (0.7,) * 3), estimator, device), 0.7)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -78,7 +77,7 @@ def test_point(estimator, device):
     """E = I cosθ / d² under a point light."""
     lamp = ir.Light("lamp", LightKind.POINT, (5.0,) * 3, placed(np.eye(3), (1.0, 2.0, 0.0)))
     expected = 5.0 * (2.0 / math.sqrt(5.0)) / 5.0 / math.pi
-    assert_mean(render(lamp, estimator, device), expected, bias=1.0e-4)
+    assert_mean(over_floor(lamp, estimator, device), expected, bias=1.0e-4)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -86,7 +85,7 @@ def test_lights_emit_from_one_side(estimator, device):
     """A rectangle or disk that faces away from the floor leaves it black."""
     for kind in (LightKind.RECT, LightKind.DISK):
         up = ir.Light("up", kind, (3.0,) * 3, placed(rotation_x(90.0), (0.0, 2.0, 0.0)))
-        np.testing.assert_array_equal(render(up, estimator, device).radiance(), 0.0)
+        np.testing.assert_array_equal(over_floor(up, estimator, device).radiance(), 0.0)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -94,10 +93,9 @@ def test_many_lights_add_up(estimator, device):
     """All the lights together give the sum of what each gives."""
     scene = floor(SHAPES[0])
     scene = type(scene)(scene.meshes, scene.materials, tuple(SHAPES), scene.camera)
-    iterations = 16 if estimator == "keller" else 512
-    settings = ir.RenderSettings(width=8, height=8, iterations=iterations, estimator=estimator, max_bounces=0)
     expected = sum(irradiance_at_origin(s) for s in SHAPES) / math.pi
-    assert_mean(ir.render(scene, settings, device=device), expected, bias=1.0e-4)
+    film = render(scene, estimator, device, max_bounces=0, light_paths=1024)
+    assert_mean(film, expected, bias=1.0e-4)
 
 
 def test_visible_lights_show_their_radiance(device):

@@ -2,7 +2,7 @@
 
 An estimator is built as ``Estimator(scene, camera, settings, launcher, size)`` from an uploaded scene, a
 `CameraData` and a (width, height), and then ``estimate(iteration, gbuffer, direct, indirect)`` fills, for
-every pixel, the radiance that reaches the camera directly (emitted, or reflected once) and indirectly.
+every pixel, what the camera sees and its irradiance over π by way of the lights and by way of surfaces.
 What it computes depends on these arguments alone.
 """
 
@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from warp_ir.device_scene import DeviceScene
 from warp_ir.estimators.keller import Keller
 from warp_ir.estimators.path import PathTracer
+from warp_ir.estimators.vpl import VplGatherer
 from warp_ir.launch import Launcher
 from warp_ir.settings import RenderSettings
 
@@ -22,8 +23,8 @@ class Estimator(Protocol):
         """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
 
 
-ESTIMATORS: dict[str, type[Estimator]] = {"keller": Keller, "path": PathTracer}
+ESTIMATORS: dict[str, type[Estimator]] = {"vpl": VplGatherer, "keller": Keller, "path": PathTracer}
 """By the names that `RenderSettings.estimator` takes."""

@@ -58,12 +58,11 @@ def _accumulate(
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
 ) -> None:
-    """L = Le + ρ/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others."""
+    """E/π = 1/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others; the film multiplies by ρ."""
     pixel = first + wp.tid()
     from_lights = wp.vec3(0.0)
     from_surfaces = wp.vec3(0.0)
-    rho = gbuffer.albedo[pixel]
-    if gbuffer.mesh[pixel] >= 0 and wp.max(rho) > 0.0:
+    if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         position = gbuffer.position[pixel]
         for k in range(vpls.count):
             g = geometry_term(
@@ -75,10 +74,8 @@ def _accumulate(
                     from_lights += irradiance
                 else:
                     from_surfaces += irradiance
-        from_lights = wp.cw_mul(from_lights, rho) / wp.pi
-        from_surfaces = wp.cw_mul(from_surfaces, rho) / wp.pi
-    direct[pixel] = gbuffer.emission[pixel] + from_lights
-    indirect[pixel] = from_surfaces
+    direct[pixel] = from_lights / wp.pi
+    indirect[pixel] = from_surfaces / wp.pi
 
 
 class Keller:
@@ -91,7 +88,7 @@ class Keller:
         self._bound = 1.0 / radius**2 if radius > 0.0 else 3.0e38
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)

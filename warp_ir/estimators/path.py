@@ -62,14 +62,14 @@ def _trace_paths(
 ) -> None:
     """Follows one path from what the camera sees at a pixel."""
     pixel = first + wp.tid()
-    once = gbuffer.emission[pixel]
+    once = wp.vec3(0.0)
     more = wp.vec3(0.0)
-    if gbuffer.mesh[pixel] >= 0 and scene.emitter_count > 0:
+    if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
         stream = sampling.hash_combine(scramble, wp.uint32(pixel))
         position = gbuffer.position[pixel]
         normal = gbuffer.normal[pixel]
         shading_normal = gbuffer.shading_normal[pixel]
-        throughput = gbuffer.albedo[pixel]
+        throughput = wp.vec3(1.0)  # after the reflection at the pixel, which is the film's
         bounce = int(0)  # reflections between this vertex's light and the camera, less one
         dimension = int(0)
         while wp.max(throughput) > 0.0:
@@ -120,7 +120,7 @@ class PathTracer:
         self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two radiances, one row per pixel, for one iteration."""
+        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)

@@ -1,0 +1,166 @@
+"""From runs to statements: medians, errors at equal time, ratios to an earlier result."""
+
+import math
+import statistics
+from collections.abc import Iterable
+from typing import Any
+
+from report import Table, number
+
+RESOLUTION = 0.05
+"""Errors below this share of the reference's own relMSE cannot be told apart, and count as this share."""
+WORSE = 1.10
+"""Time x error that has grown by more than this is marked, and fails the comparison."""
+TARGETS = {"cornell_box": 10.0, "crowded_room": 10.0, "corridor": 50.0}
+"""How many times less error than path tracing at equal time we want."""
+DENOISED_TARGET = 2.0
+"""And how many times less than the denoised peer, everywhere."""
+
+Row = dict[str, Any]
+
+
+def summarize(runs: Iterable[Row]) -> list[Row]:
+    """One row for every (scene, method, budget): medians over the seeds, and the spread of the error."""
+    groups: dict[tuple[str, str, float], list[Row]] = {}
+    for run in runs:
+        groups.setdefault((run["scene"], run["method"], run["budget"]), []).append(run)
+    rows = []
+    for (scene, method, budget), group in groups.items():
+        errors = [run["error"] for run in group]
+        row = {"scene": scene, "method": method, "budget": budget, "seeds": len(group), "floor": group[0]["floor"]}
+        for key in ("seconds", "error", "mean_ratio", "samples"):
+            row[key] = statistics.median(run[key] for run in group)
+        rows.append({**row, "error_low": min(errors), "error_high": max(errors)})
+    return rows
+
+
+def resolved(row: Row, key: str = "error") -> float:
+    """An error that can be divided by: not below what the reference resolves."""
+    return max(row[key], RESOLUTION * row["floor"], 1e-12)
+
+
+def error_at(curve: list[Row], seconds: float) -> float | None:
+    """The error that a method has after `seconds`, read off its measured curve; None long before its first picture.
+
+    Straight lines on log-log paper; beyond the ends the nearest one goes on, not steeper than 1/time and not rising.
+    """
+    points = sorted((math.log(row["seconds"]), math.log(resolved(row))) for row in curve)
+    x = math.log(seconds)
+    if x < points[0][0] - math.log(2.0):
+        return None
+    if len(points) == 1:
+        return math.exp(points[0][1] - (x - points[0][0]))
+    k = min(max(sum(px < x for px, _ in points), 1), len(points) - 1)
+    (x0, y0), (x1, y1) = points[k - 1], points[k]
+    slope = (y1 - y0) / max(x1 - x0, 1e-9)
+    if x0 <= x <= x1:
+        return math.exp(y0 + slope * (x - x0))
+    near = (x0, y0) if x < x0 else (x1, y1)
+    return math.exp(near[1] + min(max(slope, -1.0), 0.0) * (x - near[0]))
+
+
+def advantage(row: Row, rows: list[Row], peer: str) -> float | None:
+    """The peer's error over ours at equal time; None where it has no picture by then."""
+    curve = [other for other in rows if other["scene"] == row["scene"] and other["method"] == peer]
+    error = error_at(curve, row["seconds"]) if curve else None
+    return None if error is None else error / resolved(row)
+
+
+def error_tables(rows: list[Row], peers: list[str]) -> list[Table]:
+    """Error against time, scene by scene, and how that compares with the peers at equal time."""
+    tables = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        chosen = [row for row in rows if row["scene"] == scene]
+        lines = []
+        for row in chosen:
+            ratios = [advantage(row, rows, peer) if row["method"] not in peers else None for peer in peers]
+            lines.append(
+                (
+                    row["method"],
+                    number(row["budget"]),
+                    number(row["seconds"]),
+                    number(row["samples"]),
+                    number(row["error"]),
+                    f"{number(row['error_low'], 2)} … {number(row['error_high'], 2)}",
+                    f"{100.0 * row['mean_ratio']:+.2f} %",
+                    *(number(ratio) for ratio in ratios),
+                )
+            )
+        columns = ("method", "budget s", "seconds", "samples", "relMSE", "spread", "mean", *(f"× {p}" for p in peers))
+        note = f"The reference's own relMSE, subtracted: {number(chosen[0]['floor'], 2)}."
+        tables.append(Table(f"{scene}: error against time", columns, lines, note))
+    return tables
+
+
+def target_table(rows: list[Row], peers: list[str]) -> Table | None:
+    """How far the best of ours is from what we want: the worst and the best of the budgets."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        own = [row for row in rows if row["scene"] == scene and row["method"] not in peers]
+        for peer in peers:
+            wanted = TARGETS.get(scene) if peer == "mitsuba" else DENOISED_TARGET
+            by_budget: dict[float, tuple[float, str]] = {}
+            for row in own:
+                if (ratio := advantage(row, rows, peer)) is not None:
+                    best = by_budget.get(row["budget"], (0.0, ""))
+                    by_budget[row["budget"]] = max(best, (ratio, row["method"]))
+            if by_budget:
+                low, high = min(by_budget.values()), max(by_budget.values())
+                reached = "" if wanted is None else ("yes" if low[0] >= wanted else "no")
+                methods = ", ".join(dict.fromkeys((low[1], high[1])))
+                lines.append((scene, peer, number(low[0]), number(high[0]), methods, number(wanted), reached))
+    columns = ("scene", "peer", "worst budget", "best budget", "by", "wanted", "reached")
+    return Table("How many times less error than the peers, at equal time", columns, lines) if lines else None
+
+
+def breakdown_tables(runs: list[Row]) -> list[Table]:
+    """Where the time of our methods goes, and what is done in it; at the longest budget, over all seeds."""
+    longest: dict[tuple[str, str], list[Row]] = {}
+    for run in sorted(runs, key=lambda run: run["budget"]):
+        chosen = longest.setdefault((run["scene"], run["method"]), [])
+        if run["timings"]:
+            longest[run["scene"], run["method"]] = [r for r in chosen if r["budget"] == run["budget"]] + [run]
+
+    def sums(key: str) -> dict[tuple[str, str], dict[str, float]]:
+        """Of every phase or count, per second of rendering."""
+        result = {}
+        for where, group in longest.items():
+            seconds = sum(run["seconds"] for run in group)
+            names = dict.fromkeys(name for run in group for name in run[key])
+            result[where] = {name: sum(run[key].get(name, 0.0) for run in group) / seconds for name in names}
+        return {where: values for where, values in result.items() if values}
+
+    def table(title: str, values: dict[tuple[str, str], dict[str, float]], form: str, note: str = "") -> Table:
+        names = list(dict.fromkeys(name for row in values.values() for name in row))
+        lines = [
+            (scene, method, *(format(row[name], form) if name in row else "–" for name in names))
+            for (scene, method), row in values.items()
+        ]
+        return Table(title, ("scene", "method", *(name.replace("_", " ") for name in names)), lines, note)
+
+    shares = sums("timings")
+    for row in shares.values():
+        row["other"] = 1.0 - sum(row.values())
+    return [table("Where the time goes", shares, ".0%"), table("Work per second", sums("counts"), ".3g")]
+
+
+def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
+    """Time x error of this result over that of an earlier one, and whether any has become worse than `WORSE`.
+
+    Peers are compared as well: if theirs change, the machine has changed and not the code.
+    """
+    before = {(row["scene"], row["method"], row["budget"]): row for row in old}
+    lines, worse = [], False
+    for row in new:
+        earlier = before.get((row["scene"], row["method"], row["budget"]))
+        if earlier is None:
+            continue
+        seconds = row["seconds"] / earlier["seconds"]
+        error = resolved(row) / resolved(earlier)
+        merit = seconds * error
+        mark = "WORSE" if merit > WORSE else "better" if merit < 1.0 / WORSE else ""
+        worse |= merit > WORSE
+        cells = (number(row["budget"]), number(seconds), number(error), number(merit), mark)
+        lines.append((row["scene"], row["method"], *cells))
+    columns = ("scene", "method", "budget s", "time ratio", "error ratio", "time x error", "")
+    return Table("Against the earlier result", columns, lines), worse

@@ -1,0 +1,137 @@
+"""What is compared: tasks (a scene, its picture and the truth about it), and our own ways to solve them.
+
+A method has three things, and the peers in `peers/` have the same ones:
+
+    name                            for tables and for --estimators
+    prepare(task, budgets) -> dict  gets ready, until nothing is left to compile; seconds by step
+    render(seconds, seed) -> Run    a picture in about that time, and what it really took
+"""
+
+import dataclasses
+import time
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from make_references import PICTURES, REFERENCES, ROOT, digest
+
+import warp_ir as ir
+from warp_ir.settings import ESTIMATOR_NAMES
+
+SETUP = ("compile", "upload")
+"""Phases that happen once for a scene; what is timed is the rest of the call, whatever the film says it took."""
+KELLER_PATHS = 64
+"""Keller's estimator has no other knob: with the default an iteration would outlast the shorter budgets."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A picture to make, the same for every method."""
+
+    name: str
+    scene: ir.Scene
+    reference: np.ndarray
+    """Radiance by an independent renderer, float32 [height, width, 3]."""
+    reference_error: np.ndarray
+    """Its standard error, float32 [height, width, 3]."""
+    floor: float
+    """Its own relMSE, which every measured error contains and none is charged with."""
+    max_bounces: int | None = None
+
+    @property
+    def width(self) -> int:
+        return self.reference.shape[1]
+
+    @property
+    def height(self) -> int:
+        return self.reference.shape[0]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One picture and what it cost."""
+
+    picture: np.ndarray
+    """Linear radiance, [height, width, 3]."""
+    seconds: float
+    """Wall time of the render alone, up to the picture in host memory."""
+    samples: int
+    """Iterations, or samples per pixel."""
+    timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by phase."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """Rays, VPLs, ..."""
+
+
+class Method(Protocol):
+    """A way to solve tasks."""
+
+    name: str
+
+    def prepare(self, task: Task, budgets: list[float]) -> dict[str, float]: ...
+
+    def render(self, seconds: float, seed: int) -> Run: ...
+
+
+class StaleReference(Exception):
+    """The scene has changed since its reference was made: nothing can be measured against it."""
+
+
+def stored_tasks() -> list[str]:
+    """Names of the pictures that have a stored reference."""
+    return [name for name in PICTURES if (REFERENCES / f"{name}.npz").exists()]
+
+
+def load_task(name: str) -> Task:
+    """The scene and the reference of a stored picture.
+
+    Raises:
+        StaleReference: They do not belong together any more.
+    """
+    stem, _, _, max_bounces = PICTURES[name]
+    stage: Path = ROOT / "scenes_usd" / f"{stem}.usda"
+    with np.load(REFERENCES / f"{name}.npz") as stored:
+        if str(stored["scene_sha256"]) != digest(stage):
+            raise StaleReference(f"{stage.name} is newer than its reference: run make_references.py {name}")
+        mean, error, floor = stored["mean"], stored["standard_error"], float(stored["floor"])
+    return Task(name, ir.load_usd(stage), mean, error, floor, max_bounces)
+
+
+class Ours:
+    """One of our estimators through the public API, as a user would call it."""
+
+    def __init__(self, name: str, device: str, **choices: Any) -> None:
+        self.name, self.device, self.choices = name, device, choices
+
+    def prepare(self, task: Task, budgets: list[float]) -> dict[str, float]:
+        self._scene = task.scene
+        self._settings = ir.RenderSettings(
+            width=task.width, height=task.height, max_bounces=task.max_bounces, **self.choices
+        )
+        first = ir.render(self._scene, dataclasses.replace(self._settings, iterations=1), device=self.device)
+        first.radiance()
+        return {step: first.timings.get(step, 0.0) for step in SETUP}
+
+    def render(self, seconds: float, seed: int) -> Run:
+        settings = dataclasses.replace(self._settings, time_limit=seconds, seed=seed)
+        start = time.perf_counter()
+        film = ir.render(self._scene, settings, device=self.device)
+        picture = film.radiance()
+        took = time.perf_counter() - start - sum(film.timings.get(step, 0.0) for step in SETUP)
+        phases = {name: t for name, t in film.timings.items() if name not in SETUP}
+        return Run(picture, took, film.iterations, phases, film.counts)
+
+
+def own_methods(device: str) -> dict[str, Ours]:
+    """All of our estimators, and `vpl` without its filter and with the denoiser where it has them."""
+    choices: dict[str, dict[str, Any]] = {name: {"estimator": name} for name in ESTIMATOR_NAMES}
+    if "keller" in choices:
+        choices["keller"]["light_paths"] = KELLER_PATHS
+    switches = {setting.name for setting in dataclasses.fields(ir.RenderSettings)}
+    if "vpl" in choices and "filter" in switches:
+        choices["vpl-unfiltered"] = {"estimator": "vpl", "filter": False}
+    if "vpl" in choices and "denoise" in switches and find_spec("pyoidn"):
+        choices["vpl-denoised"] = {"estimator": "vpl", "denoise": True}
+    return {name: Ours(name, device, **choice) for name, choice in choices.items()}

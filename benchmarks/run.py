@@ -1,0 +1,204 @@
+"""Error against time, at equal time: every scene with a stored reference, every estimator, and other renderers.
+
+    python benchmarks/run.py [-k NAME ...] [--device cpu] [--seconds 0.2 0.6 2] [--seeds 3] [--estimators NAME ...]
+                             [--peers] [--json FILE] [--plot FILE.png] [--compare OLD.json] [--quick]
+
+Methods take turns within one run, on the same cores, with everything compiled and uploaded beforehand (those
+seconds are reported apart). Every number is the median over seeds.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from analysis import breakdown_tables, compare, error_tables, resolved, summarize, target_table
+from methods import Method, StaleReference, Task, load_task, own_methods, stored_tasks
+from peers import find_peers
+from report import Table, environment, number, publish
+
+from warp_ir.metrics import mean_ratio, relative_mse
+
+QUICK = {"names": ["cornell_box", "furnace_cube"], "seconds": [0.1], "seeds": 1}
+
+
+def measure(task: Task, methods: list[Method], budgets: list[float], seeds: int) -> list[dict[str, Any]]:
+    """Runs all methods in turn, for every seed and budget: what each took and how wrong it was."""
+    runs = []
+    for seed in range(1, seeds + 1):
+        for budget in budgets:
+            for method in methods:
+                run = method.render(budget, seed)
+                runs.append(
+                    {
+                        "scene": task.name,
+                        "method": method.name,
+                        "budget": budget,
+                        "seed": seed,
+                        "seconds": run.seconds,
+                        "samples": run.samples,
+                        "error": relative_mse(run.picture, task.reference, reference_error=task.reference_error),
+                        "mean_ratio": mean_ratio(run.picture, task.reference),
+                        "floor": task.floor,
+                        "timings": run.timings,
+                        "counts": run.counts,
+                    }
+                )
+    return runs
+
+
+def measure_all(
+    names: list[str], methods: list[Method], budgets: list[float], seeds: int
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, str]]:
+    """The runs of all scenes, the seconds of getting ready, and what was skipped and why."""
+    runs, setup, skipped = [], [], {}
+    for name in names:
+        try:
+            task = load_task(name)
+        except StaleReference as error:
+            skipped[name] = str(error)
+            continue
+        able = []
+        for method in methods:
+            try:
+                setup.append({"scene": name, "method": method.name, **method.prepare(task, budgets)})
+                able.append(method)
+            except NotImplementedError as error:
+                skipped[f"{method.name} on {name}"] = str(error)
+        print(f"{name}: {', '.join(method.name for method in able)}", file=sys.stderr, flush=True)
+        runs += measure(task, able, budgets, seeds)
+    return runs, setup, skipped
+
+
+def setup_table(setup: list[dict[str, Any]]) -> Table:
+    """Seconds before the first picture: the worst scene and the median one, by method."""
+    lines = []
+    for method in dict.fromkeys(row["method"] for row in setup):
+        chosen = [row for row in setup if row["method"] == method]
+        cells = []
+        for step in ("compile", "upload"):
+            seconds = [row[step] for row in chosen]
+            cells += [number(statistics.median(seconds)), number(max(seconds))]
+        lines.append((method, *cells))
+    columns = ("method", "compile s, median", "worst", "upload s, median", "worst")
+    note = "Kernels come from the cache if they are in it; the peers' compilation includes their pilot renders."
+    return Table("Before the clock starts", columns, lines, note)
+
+
+def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """Error against seconds on log-log axes, a panel for each scene; bars show the spread of the seeds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
+
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    budgets = sorted({row["budget"] for row in rows})
+    columns = min(len(scenes), 4)
+    lines = -(-len(scenes) // columns)
+    figure, panels = plt.subplots(
+        lines, columns, figsize=(4 * columns, 3.4 * lines), squeeze=False, layout="constrained"
+    )
+    for panel in panels.flat[len(scenes) :]:
+        panel.set_visible(False)
+    for panel, scene in zip(panels.flat, scenes, strict=False):
+        for k, method in enumerate(methods):
+            curve = sorted(
+                (row for row in rows if row["scene"] == scene and row["method"] == method),
+                key=lambda row: row["seconds"],
+            )
+            middle = [resolved(row) for row in curve]
+            below = [m - min(resolved(row, "error_low"), m) for m, row in zip(middle, curve, strict=True)]
+            above = [resolved(row, "error_high") - m for m, row in zip(middle, curve, strict=True)]
+            style = "--" if method.startswith("mitsuba") else "-"
+            seconds = [row["seconds"] for row in curve]
+            panel.errorbar(seconds, middle, [below, above], fmt=f"o{style}", color=f"C{k}", label=method, ms=3)
+        floor = next(row["floor"] for row in rows if row["scene"] == scene)
+        panel.axhline(floor, color="0.7", lw=0.8, ls=":")
+        panel.set(xscale="log", yscale="log", title=scene, xlabel="seconds", ylabel="relMSE")
+        panel.set_xticks(budgets, [f"{budget:g}" for budget in budgets])
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        left, right = panel.get_xlim()
+        panel.set_xlim(min(left, 0.5 * budgets[0]), max(right, 2.0 * budgets[-1]))
+    handles, labels = panels.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.suptitle(title, fontsize="small")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The command line, its names checked and its defaults filled in."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("-k", dest="names", nargs="+", metavar="NAME", help="scenes; all with a reference by default")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda:N")
+    parser.add_argument("--seconds", type=float, nargs="+", help="time budgets; 0.2, 0.6 and 2 by default")
+    parser.add_argument("--seeds", type=int, help="repetitions; 3 by default")
+    parser.add_argument("--estimators", nargs="+", metavar="NAME", help="ours to run; all by default")
+    parser.add_argument("--peers", action="store_true", help="measure the other renderers that are installed")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw error against time")
+    parser.add_argument("--compare", type=Path, metavar="OLD.json", help="fail if time x error is worse than there")
+    parser.add_argument("--quick", action="store_true", help="two scenes, 0.1 s, one seed: does it run?")
+    options = parser.parse_args(arguments)
+    defaults = QUICK if options.quick else {"names": stored_tasks(), "seconds": [0.2, 0.6, 2.0], "seeds": 3}
+    for name, value in defaults.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
+    if unknown := sorted(set(options.names) - set(stored_tasks())):
+        parser.error(f"no reference for {', '.join(unknown)}; there are {', '.join(stored_tasks())}")
+    known = own_methods(options.device)
+    if unknown := sorted(set(options.estimators or known) - set(known)):
+        parser.error(f"no estimator {', '.join(unknown)}; there are {', '.join(known)}")
+    options.own = [known[name] for name in options.estimators or known]
+    return options
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measures and reports; 1 if something is worse than in the result to compare with."""
+    options = parse(arguments)
+    wp.config.log_level = wp.LOG_WARNING
+    peers, absent = find_peers(options.device) if options.peers else ({}, {})
+    methods = [*options.own, *peers.values()]
+    runs, setup, skipped = measure_all(options.names, methods, options.seconds, options.seeds)
+    for what, why in {**absent, **skipped}.items():
+        print(f"skipped {what}: {why}", file=sys.stderr)
+    if not runs:
+        return 1
+    rows = summarize(runs)
+    results = {
+        "environment": environment(options.device),
+        "settings": {method.name: method.choices for method in options.own},
+        "seconds": options.seconds,
+        "seeds": options.seeds,
+        "skipped": {**absent, **skipped},
+        "rows": rows,
+        "setup": setup,
+        "runs": runs,
+    }
+    tables = [
+        *error_tables(rows, list(peers)),
+        target_table(rows, list(peers)),
+        *breakdown_tables(runs),
+        setup_table(setup),
+    ]
+    worse = False
+    if options.compare is not None:
+        old = json.loads(options.compare.read_text())
+        table, worse = compare(rows, old.get("error", old)["rows"])
+        tables.append(table)
+    shown = [table for table in tables if table is not None]
+    publish(shown, results, json_path=options.json, markdown_path=options.markdown)
+    if options.plot is not None:
+        plot(rows, options.plot, f"{results['environment']['device_name']}, {results['environment']['commit']}")
+    return int(worse)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""The benchmarks measure what they say: floors are subtracted, equal time is equal, and a loss of speed is caught."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_ir.procedural import furnace
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture(autouse=True)
+def _benchmarks_on_path(monkeypatch):
+    """They are programs: each finds the others beside it."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def row(method="vpl", budget=1.0, seconds=1.0, error=0.01, floor=0.0, **more):
+    """A line of results."""
+    return {
+        "scene": "box",
+        "method": method,
+        "budget": budget,
+        "seconds": seconds,
+        "error": error,
+        "floor": floor,
+        "mean_ratio": 0.0,
+        "samples": 1,
+        **more,
+    }
+
+
+def perfect_task(noise):
+    """A furnace, whose radiance 2 is known, with a reference that is noisy and knows by how much."""
+    from methods import Task
+
+    random = np.random.default_rng(1)
+    reference = 2.0 + noise * random.normal(size=(16, 16, 3))
+    error = np.full_like(reference, noise)
+    floor = float(np.mean(error**2 / (reference**2 + 0.01 * reference.mean() ** 2)))
+    return Task("furnace", furnace(level=2), reference, error, floor)
+
+
+class Perfect:
+    """A method that knows the answer."""
+
+    name = "perfect"
+
+    def render(self, seconds, seed):
+        from methods import Run
+
+        return Run(np.full((16, 16, 3), 2.0), seconds, 1)
+
+
+def test_reference_noise_is_not_charged():
+    """A perfect picture scores 0 against a noisy reference, within the scatter of a χ² of 768 values."""
+    from run import measure
+
+    task = perfect_task(noise=0.1)
+    (run,) = measure(task, [Perfect()], [0.1], 1)
+    assert abs(run["error"]) < 4.0 * math.sqrt(2.0 / 768) * task.floor
+    assert abs(run["mean_ratio"]) < 4.0 * 0.05 / math.sqrt(768)
+
+
+def test_our_estimators_keep_to_the_budget_and_come_close():
+    """Each estimator takes about the time it is given, and gets the furnace right within 10 %."""
+    from methods import own_methods
+    from run import measure
+
+    task = perfect_task(noise=0.0)
+    methods = [method for name, method in own_methods("cpu").items() if name != "vpl-denoised"]
+    for method in methods:
+        assert set(method.prepare(task, [0.05])) == {"compile", "upload"}
+    for run in measure(task, methods, [0.05], 1):
+        assert 0.0 < run["seconds"] < 5.0
+        assert run["error"] < 0.1, run["method"]
+        assert abs(run["mean_ratio"]) < 0.1, run["method"]
+
+
+def test_medians_and_spread():
+    """One row per scene, method and budget: the median, the least, the largest."""
+    from analysis import summarize
+
+    (only,) = summarize(row(error=error) for error in (0.03, 0.01, 0.02))
+    assert (only["error"], only["error_low"], only["error_high"], only["seeds"]) == (0.02, 0.01, 0.03, 3)
+
+
+def test_equal_time_is_read_off_the_curve():
+    """A curve that falls as 1/time is continued as such; one that has levelled off stays level."""
+    from analysis import advantage, error_at
+
+    falling = [row(seconds=t, error=0.1 / t) for t in (1.0, 2.0)]
+    assert error_at(falling, 1.4) == pytest.approx(0.1 / 1.4)
+    assert error_at(falling, 4.0) == pytest.approx(0.1 / 4.0)
+    assert error_at(falling[:1], 2.0) == pytest.approx(0.05)
+    assert error_at([row(seconds=t, error=0.1) for t in (1.0, 2.0)], 100.0) == pytest.approx(0.1)
+    assert error_at(falling, 0.1) is None
+    rows = [row("mitsuba", seconds=t, error=0.1 / t) for t in (1.0, 2.0)] + [row(seconds=2.0, error=0.01)]
+    assert advantage(rows[-1], rows, "mitsuba") == pytest.approx(5.0)
+
+
+def test_errors_below_the_reference_noise_do_not_count():
+    """Near the floor a smaller error is luck, and a negative one as well: ratios see the same number."""
+    from analysis import compare
+
+    _, worse = compare([row(error=1e-6, floor=1e-3)], [row(error=-1e-7, floor=1e-3)])
+    assert not worse
+
+
+@pytest.mark.parametrize(("factor", "code"), [(0.5, 1), (1.0, 0), (2.0, 0)])
+def test_compare_fails_if_it_has_become_worse(tmp_path, monkeypatch, factor, code):
+    """The exit code is 1 if time x error exceeds the earlier result by 10 %: here the earlier one is `factor` of it."""
+    import run
+
+    monkeypatch.setattr(run, "measure_all", lambda *_: ([{**row(), "timings": {}, "counts": {}}], [], {}))
+    old = tmp_path / "old.json"
+    old.write_text(json.dumps({"rows": [row(error=0.01 * factor)]}))
+    assert run.main(["-k", "furnace_cube", "--estimators", "path", "--compare", str(old)]) == code
+
+
+def test_quick_run_writes_everything(tmp_path):
+    """Table, numbers with their circumstances, and plot."""
+    pytest.importorskip("matplotlib")
+    import run
+
+    files = {kind: tmp_path / f"result.{kind}" for kind in ("json", "md", "png")}
+    arguments = ["--quick", "-k", "furnace_cube", "--estimators", "path", "vpl", "--seconds", "0.05"]
+    arguments += ["--json", str(files["json"]), "--markdown", str(files["md"]), "--plot", str(files["png"])]
+    assert run.main(arguments) == 0
+    result = json.loads(files["json"].read_text())
+    assert {"date", "commit", "device", "device_name", "cpu_count", "versions"} <= set(result["environment"])
+    assert {r["method"] for r in result["rows"]} == {"path", "vpl"}
+    assert "| path |" in files["md"].read_text()
+    assert files["png"].read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_wrinkled_ball_is_closed():
+    """Every edge of the procedural ball that has two ends belongs to two triangles, whatever its size."""
+    from scaling import ball
+
+    mesh = ball(1_000)
+    points = np.unique(mesh.points.round(9), axis=0, return_inverse=True)[1].reshape(-1)  # the poles are one point each
+    corners = points[mesh.triangles]
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
+    assert (counts % 2 == 0).all()

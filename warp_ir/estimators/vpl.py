@@ -1,0 +1,163 @@
+"""Progressive instant radiosity: Keller's VPLs, gathered with few rays, bounded and compensated.
+
+The sum over VPLs is estimated by `gather`. Its bound b on G takes energy away where surfaces come close to each
+other; that energy is put back by following one cosine-distributed ray (Kollig and Keller 2004):
+
+    E(x) = Σ I min(G, b) V + ∫ L(y) (1 - b/G)⁺ cosθ dω,        y what the ray meets
+
+The ray is as short as 1/√b, since G ≤ 1/d² cannot exceed b farther away, and most rays are short misses. What
+it meets has gathered in turn, and so on. Emission met on the way is the part that the bound took from the VPLs on
+that light, no more: nothing counts twice.
+
+The bound follows the density of the VPLs: 1/b is the area that a VPL stands for, times a constant.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_ir import sampling
+from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.gather import Irradiance, Receiver, VplSets, arrange, gather
+from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.launch import Launcher
+from warp_ir.lights import lights_beyond
+from warp_ir.settings import RenderSettings
+from warp_ir.surface import albedo, closest, emission
+from warp_ir.vpl import emit_vpls
+
+wp.set_module_options({"enable_backward": False})
+
+_UNLIMITED = 2**31 - 1
+import os
+
+SHADOW_RAYS = int(os.environ.get("M", 4))
+COMPENSATION_RAYS = int(os.environ.get("MC", 2))
+
+
+@wp.struct
+class GatherSettings:
+    """What the gathering kernel needs to know beside the scene."""
+
+    columns: int  # pixels per row
+    scramble: wp.uint32
+    rotation: int  # which set the first pixel takes
+    rays: int
+    rays_after: int  # where a compensation ray ends
+    max_bounces: int
+
+
+@wp.func
+def _spread(x: int) -> int:
+    """Sixteen bits, with a zero between any two."""
+    y = (x | (x << 8)) & 0x00FF00FF
+    y = (y | (y << 4)) & 0x0F0F0F0F
+    y = (y | (y << 2)) & 0x33333333
+    return (y | (y << 1)) & 0x55555555
+
+
+@wp.kernel
+def _gather_pixels(
+    first: int,
+    scene: SceneData,
+    gbuffer: GBuffer,
+    lit: VplSets,
+    settings: GatherSettings,
+    direct: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+) -> None:
+    """Irradiance over π of what one pixel sees."""
+    pixel = first + wp.tid()
+    once = wp.vec3(0.0)
+    more = wp.vec3(0.0)
+    if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
+        # Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels.
+        index = _spread(pixel % settings.columns) | (_spread(pixel // settings.columns) << 1)
+        chosen_set = (index + settings.rotation) % lit.sets
+        x = Receiver()
+        x.position = gbuffer.position[pixel]
+        x.normal = gbuffer.normal[pixel]
+        x.shading_normal = gbuffer.shading_normal[pixel]
+        throughput = wp.vec3(1.0)
+        reach = 1.0 / wp.sqrt(lit.bound)
+        depth = int(0)
+        rays = settings.rays
+        while depth <= settings.max_bounces:
+            u = sampling.sample_2d(scene.sobol, index, 4 * depth, settings.scramble)
+            e = gather(scene, lit, chosen_set, x, u, rays, settings.max_bounces - depth)
+            if depth == 0:
+                once = e.direct
+                more = e.indirect
+            else:
+                more += wp.cw_mul(throughput, e.direct + e.indirect)
+
+            v = sampling.sample_2d(scene.sobol, index, 4 * depth + 2, settings.scramble)
+            direction = sampling.to_cosine_hemisphere(v, x.shading_normal)
+            if wp.dot(direction, x.normal) <= 0.0:
+                break
+            cosine = wp.dot(direction, x.shading_normal)
+            hit = closest(scene, x.position, direction, reach)
+            near = wp.where(hit.triangle < 0, reach, hit.t)
+            found = lights_beyond(scene, x.position, direction, near, cosine, lit.bound)
+            cut = float(0.0)
+            if hit.triangle >= 0:
+                g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
+                cut = 1.0 - wp.min(lit.bound / g, 1.0)
+                found += emission(scene, hit) * cut
+            found = wp.cw_mul(throughput, found) * wp.pi
+            if depth == 0:
+                once += found
+            else:
+                more += found
+            if cut <= 0.0:
+                break
+            throughput = wp.cw_mul(throughput, albedo(scene, hit)) * cut
+            if depth > 2:
+                survival = wp.min(wp.max(throughput), 0.99)
+                if wp.frac(v[0] * 1024.0) >= survival:
+                    break
+                throughput = throughput / survival
+            x.position = hit.position
+            x.normal = hit.normal
+            x.shading_normal = hit.normal
+            rays = settings.rays_after
+            depth += 1
+    direct[pixel] = once / wp.pi
+    indirect[pixel] = more / wp.pi
+
+
+class VplGatherer:
+    """Few shadow rays, resampled; bounded and compensated."""
+
+    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
+        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
+        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+
+    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
+        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
+        settings, launcher = self._settings, self._launcher
+        scramble = sampling.iteration_scramble(settings.seed, iteration)
+        with launcher.phase("primary"):
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+        with launcher.phase("emission"):
+            vpls = emit_vpls(
+                self._scene,
+                launcher,
+                paths=settings.light_paths,
+                absorption=settings.absorption or "roulette",
+                max_bounces=settings.max_bounces,
+                scramble=scramble,
+            )
+            lit = arrange(vpls, self._scene.area, launcher)
+        how = GatherSettings()
+        how.columns = self._camera.columns
+        how.scramble = wp.uint32(scramble ^ 0x5BD1E995)
+        how.rotation = scramble % lit.sets
+        how.rays, how.rays_after = SHADOW_RAYS, COMPENSATION_RAYS
+        how.max_bounces = _UNLIMITED if settings.max_bounces is None else settings.max_bounces
+        with launcher.phase("gather"):
+            launcher.launch(
+                _gather_pixels,
+                gbuffer.mesh.shape[0],
+                [self._scene.data, gbuffer, lit, how, direct, indirect],
+            )

@@ -1,0 +1,269 @@
+"""Gathering: the unbiased light of many VPLs at one point for the price of a few shadow rays.
+
+At a point x, f_k = I_k min(G(x, y_k), b_k) is what VPL k gives if it is visible; the f are cheap, visibility is dear.
+
+* **Weigh in blocks.** Sixteen VPLs side by side are weighed in vector registers; on CUDA a thread weighs one at a time.
+* **Resample visibility.** M of the VPLs are chosen in proportion to f and only they get a shadow ray, each
+  standing for S/M, S being the sum of all f: unbiased (systematic resampling; Talbot et al. 2005 for the idea).
+* **Interleave.** The VPLs come in sets, and a pixel weighs one of them, its neighbours another (Keller and Heidrich
+  2001): the cost of a pixel does not grow with the number of VPLs.
+* **Bound.** min(G, b) takes away the weak singularity; what it takes is given back by `estimators.vpl`.
+"""
+
+import math
+from typing import Any
+
+import warp as wp
+
+from warp_ir.bvh import _on_cuda
+from warp_ir.device_scene import SceneData
+from warp_ir.launch import Launcher
+from warp_ir.surface import visible
+from warp_ir.vpl import VplBuffer
+
+wp.set_module_options({"enable_backward": False})
+
+LANES = 16
+_LANES = wp.constant(LANES)
+_ROWS = wp.constant(10)
+BLOCKS_PER_SET = 16
+"""A pixel weighs about 16 x 16 VPLs: a fraction of the cost of the shadow rays that follow."""
+MAX_SETS = 64
+_INFINITE = 3.0e38
+_UNBOUNDED = wp.constant(_INFINITE)
+import os
+
+AREA_PER_VPL = float(os.environ.get("C", 8.0))
+
+vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
+vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
+
+
+@wp.struct
+class VplSets:
+    """VPLs arranged for weighing: `sets` sets of `blocks` blocks of 16, the last padded with VPLs of no intensity.
+
+    Ten rows per block: x, y, z, w of the position, x, y, z, a of the normal, luminance, bound on G.
+    """
+
+    sets: int
+    blocks: int  # per set
+    bound: float
+    rows: wp.array[vec16]
+    vpls: VplBuffer
+
+
+@wp.struct
+class Receiver:
+    """A surface point that gathers."""
+
+    position: wp.vec3
+    normal: wp.vec3  # geometric
+    shading_normal: wp.vec3
+
+
+@wp.struct
+class Irradiance:
+    """Irradiance [W m⁻²] by way of the lights themselves, and by way of surfaces."""
+
+    direct: wp.vec3
+    indirect: wp.vec3
+
+
+@wp.func
+def luminance(color: wp.vec3) -> float:
+    """Mean of the channels: all that matters here is that no channel is forgotten."""
+    return (color[0] + color[1] + color[2]) * (1.0 / 3.0)
+
+
+@wp.func
+def bounded_geometry_term(x: Receiver, position: wp.vec4, normal: wp.vec4, bound: float) -> float:
+    """min(G, bound) between a receiver and a VPL; 0 behind the surface, whatever its interpolated normal says."""
+    to_vpl = wp.vec3(position[0], position[1], position[2]) - x.position * position[3]
+    squared = wp.dot(to_vpl, to_vpl) + 1.0e-30
+    inverse = 1.0 / wp.sqrt(squared)
+    direction = to_vpl * inverse
+    at_x = wp.dot(x.shading_normal, direction)
+    at_vpl = normal[3] - wp.dot(wp.vec3(normal[0], normal[1], normal[2]), direction)
+    if at_x <= 0.0 or at_vpl <= 0.0 or wp.dot(x.normal, direction) <= 0.0:
+        return 0.0
+    return wp.min(at_x * at_vpl / squared, bound)
+
+
+@wp.func_native("""
+    const wp::vec_t<16, float>* b = rows.data + first;
+    wp::vec_t<16, float> f;
+    for (int i = 0; i < 16; ++i) {
+        const float w = b[3][i];
+        const float dx = b[0][i] - x.position[0] * w, dy = b[1][i] - x.position[1] * w, dz = b[2][i] - x.position[2] * w;
+        const float squared = dx * dx + dy * dy + dz * dz + 1.0e-30f;
+        const float inverse = 1.0f / sqrtf(squared);
+        const float geometric = x.normal[0] * dx + x.normal[1] * dy + x.normal[2] * dz;
+        const float shading = x.shading_normal[0] * dx + x.shading_normal[1] * dy + x.shading_normal[2] * dz;
+        const float facing = b[7][i] - (b[4][i] * dx + b[5][i] * dy + b[6][i] * dz) * inverse;
+        const float g = shading * inverse * facing * inverse * inverse;
+        const float bounded = g < b[9][i] ? g : b[9][i];
+        const bool seen = (geometric > 0.0f) & (shading > 0.0f) & (facing > 0.0f);
+        f[i] = seen ? bounded * b[8][i] : 0.0f;
+    }
+    return f;
+""")
+def _weigh(rows: wp.array[vec16], first: int, x: Receiver) -> vec16:
+    """Luminance of f for the sixteen VPLs of a block: `bounded_geometry_term` in lanes, without a branch."""
+    ...
+
+
+@wp.func_native("""
+    wp::vec_t<16, int> out;
+    for (int i = 0; i < 16; ++i) out[i] = count[i] + (sum[i] <= target[i] ? 1 : 0);
+    return out;
+""")
+def _count_below(sum: vec16, target: vec16, count: vec16i) -> vec16i:
+    """One more in every lane whose running sum has not passed its target."""
+    ...
+
+
+@wp.func_native("""
+    float total = 0.0f;
+    for (int i = 0; i < 16; ++i) total += v[i];
+    return total;
+""")
+def _sum(v: vec16) -> float: ...
+
+
+@wp.func
+def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, vpl: int, share: float, max_bounce: int) -> Irradiance:
+    """What the chosen VPL gives: `share` (= S/M) in the colour of its intensity, if it is visible."""
+    out = Irradiance()
+    if vpl < lit.vpls.count:
+        bounce = lit.vpls.bounce[vpl]
+        if bounce <= max_bounce and visible(scene, x.position, lit.vpls.position[vpl]):
+            intensity = lit.vpls.intensity[vpl]
+            irradiance = intensity * (share / luminance(intensity))
+            if bounce == 0:
+                out.direct = irradiance
+            else:
+                out.indirect = irradiance
+    return out
+
+
+@wp.func
+def gather(
+    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+) -> Irradiance:
+    """Irradiance at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
+
+    `u` in [0, 1)² are the offsets of the two systematic choices; VPLs of more than `max_bounce` reflections are dark.
+    """
+    out = Irradiance()
+    if _on_cuda():
+        out = _gather_one_by_one(scene, lit, chosen_set, x, u, rays, max_bounce)
+    else:
+        out = _gather_in_blocks(scene, lit, chosen_set, x, u, rays, max_bounce)
+    scale = float(lit.sets)
+    out.direct = out.direct * scale
+    out.indirect = out.indirect * scale
+    return out
+
+
+@wp.func
+def _gather_in_blocks(
+    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+) -> Irradiance:
+    out = Irradiance()
+    begin = chosen_set * lit.blocks
+    sums = vec16()
+    for block in range(begin, begin + lit.blocks):
+        sums += _weigh(lit.rows, _ROWS * block, x)
+    total = _sum(sums)
+    if total <= 0.0:
+        return out
+    # Every lane is a stratum: one candidate from each, in proportion to f ...
+    target = sums * u[0]
+    running = vec16()
+    candidate = vec16i()
+    for block in range(begin, begin + lit.blocks):
+        running += _weigh(lit.rows, _ROWS * block, x)
+        candidate = _count_below(running, target, candidate)
+    # ... and of the sixteen candidates M, in proportion to the sums of their lanes.
+    share = total / float(rays)
+    passed = float(0.0)
+    drawn = int(0)
+    for lane in range(_LANES):
+        passed += sums[lane]
+        while drawn < rays and (float(drawn) + u[1]) * share < passed:
+            vpl = _LANES * (begin + wp.min(candidate[lane], lit.blocks - 1)) + lane
+            one = _shadowed(scene, lit, x, vpl, share, max_bounce)
+            out.direct += one.direct
+            out.indirect += one.indirect
+            drawn += 1
+    return out
+
+
+@wp.func
+def _gather_one_by_one(
+    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+) -> Irradiance:
+    """The same for a thread without lanes: one running sum, M targets along it."""
+    out = Irradiance()
+    begin = chosen_set * lit.blocks * _LANES
+    end = wp.min(begin + lit.blocks * _LANES, lit.vpls.count)
+    total = float(0.0)
+    for vpl in range(begin, end):
+        total += _weigh_one(lit, x, vpl)
+    if total <= 0.0:
+        return out
+    share = total / float(rays)
+    running = float(0.0)
+    drawn = int(0)
+    for vpl in range(begin, end):
+        running += _weigh_one(lit, x, vpl)
+        while drawn < rays and (float(drawn) + u[1]) * share < running:
+            one = _shadowed(scene, lit, x, vpl, share, max_bounce)
+            out.direct += one.direct
+            out.indirect += one.indirect
+            drawn += 1
+    return out
+
+
+@wp.func
+def _weigh_one(lit: VplSets, x: Receiver, vpl: int) -> float:
+    normal = lit.vpls.normal[vpl]
+    bound = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
+    return luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
+
+
+@wp.kernel
+def _pack(first: int, lit: VplSets) -> None:
+    """Writes block `i`."""
+    i = first + wp.tid()
+    for lane in range(_LANES):
+        vpl = _LANES * i + lane
+        position = wp.vec4(0.0)
+        normal = wp.vec4(0.0)
+        strength = float(0.0)
+        if vpl < lit.vpls.count:
+            position = lit.vpls.position[vpl]
+            normal = lit.vpls.normal[vpl]
+            strength = luminance(lit.vpls.intensity[vpl])
+        for k in range(4):
+            lit.rows[_ROWS * i + k][lane] = position[k]
+            lit.rows[_ROWS * i + 4 + k][lane] = normal[k]
+        lit.rows[_ROWS * i + 8][lane] = strength
+        lit.rows[_ROWS * i + 9][lane] = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
+
+
+def arrange(vpls: Any, area: float, launcher: Launcher) -> Any:
+    """The `VplSets` of a `VplBuffer` on surfaces of some area in the device's frame, which gives the bound on G."""
+    lit = VplSets()
+    blocks = -(-vpls.count // LANES)
+    lit.sets = 1
+    while lit.sets < MAX_SETS and blocks >= 2 * lit.sets * BLOCKS_PER_SET:
+        lit.sets *= 2
+    lit.blocks = -(-blocks // lit.sets)
+    lit.bound = math.pi * max(vpls.count, 1) / (AREA_PER_VPL * area) if area > 0.0 else _INFINITE
+    lit.vpls = vpls
+    lit.rows = launcher.empty(max(_ROWS * lit.sets * lit.blocks, 1) if not launcher.device.is_cuda else 1, vec16)
+    if not launcher.device.is_cuda:
+        launcher.launch(_pack, lit.sets * lit.blocks, [lit])
+    return lit
