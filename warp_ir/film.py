@@ -95,8 +95,8 @@ class Film:
         """Iterations added."""
         self.seconds = 0.0
         """Wall time of rendering them [s], without loading and compiling."""
-        self.interrupted = False
-        """Whether a signal ended the render before its limit."""
+        self.interrupted = 0
+        """Number of the signal that ended the render before its limit; 0: none did."""
         self.settings: Any = None
         """The `RenderSettings` it was rendered with."""
         self.timings: dict[str, float] = {}

@@ -67,24 +67,31 @@ class Launcher:
         if count <= 0:
             return
         if self.device.is_cuda:
-            self._run(kernel, 0, count, inputs)
+            wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
         bands = min(count, self.threads * _BANDS_PER_THREAD)
         edges = [count * k // bands for k in range(bands + 1)]
-        spans = pairwise(edges)
-        if self._pool is None or count < 256:
-            finished = [self._run(kernel, a, b, inputs) for a, b in spans]
+        spans = iter(list(pairwise(edges)))
+        # Packing the arguments costs more than a band may take: once per thread, not once per band.
+        workers = self.threads if count >= 256 else 1
+        commands = [
+            wp.launch(kernel, dim=1, inputs=[0, *inputs], device=self.device, record_cmd=True) for _ in range(workers)
+        ]
+        if self._pool is None or workers == 1:
+            self._work(commands[0], spans)
         else:
-            finished = list(self._pool.map(lambda span: self._run(kernel, span[0], span[1], inputs), spans))
-        if not all(finished):
+            list(self._pool.map(lambda command: self._work(command, spans), commands))
+        if self._cancelled.is_set():
             raise Cancelled
 
-    def _run(self, kernel: Any, begin: int, end: int, inputs: Sequence[Any]) -> bool:
-        """Runs one band, unless cancelled; whether it ran."""
-        if self._cancelled.is_set():
-            return False
-        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], device=self.device, block_dim=_BLOCK_DIM)
-        return True
+    def _work(self, command: Any, spans: Iterator[tuple[int, int]]) -> None:
+        """Runs bands from the common list until none is left; taking one is atomic, since it holds the GIL."""
+        for begin, end in spans:
+            if self._cancelled.is_set():
+                return
+            command.set_param_at_index(0, begin)
+            command.set_dim(end - begin)
+            command.launch()
 
     def cancel(self) -> None:
         """Abandons the launches in flight as soon as may be; safe from a signal handler or another thread."""

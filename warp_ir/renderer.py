@@ -211,7 +211,7 @@ def _signals_cancel(launcher: Launcher, film: Film) -> Iterator[None]:
         return
 
     def stop(number: int, _: Any) -> None:
-        film.interrupted = True
+        film.interrupted = number
         launcher.cancel()
 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
