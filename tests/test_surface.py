@@ -37,7 +37,7 @@ def _bounce(first: int, scene: SceneData, origin: wp.vec3, self_hits: wp.array[w
 @pytest.mark.parametrize("shift", [0.0, 1e5])
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
 def test_no_ray_hits_where_it_starts(launcher, scale, shift, shape):
-    """In a closed room no ray hits its own triangle, none escapes, and what it hits can be seen from where it started."""
+    """In a closed room no ray hits its own triangle, none escapes, and what it hits is seen from where it started."""
     points, triangles = sphere(level=4) if shape == "sphere" else cube()
     room = mesh("room", (points + shift) * scale, triangles)
     uploaded = upload_scene(ir.Scene(meshes=(room,)), launcher)

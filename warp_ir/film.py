@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ir.denoise import denoise
 from warp_ir.gbuffer import GBuffer
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError
@@ -150,12 +151,21 @@ class Film:
     def radiance(self) -> npt.NDArray[np.float32]:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
-        The mean of the iterations, its noise filtered if the settings say so and there are at least two.
+        The mean of the iterations, its noise filtered or denoised if the settings say so and there are at least two.
         """
+        if self.settings is not None and self.settings.denoise and self.iterations > 1:
+            return self._denoised()
         if self.reconstruction is not None and self.iterations > 1:
             direct, indirect = self._reconstruct()
             return np.asarray(direct + indirect)
         return self._mean(*_RADIANCE).astype(np.float32)
+
+    def _denoised(self) -> npt.NDArray[np.float32]:
+        if self._resolved[0] != self.iterations:
+            with self._launcher.phase("filter"):
+                picture = denoise(self._mean(*_RADIANCE), self.aov("albedo"), self.aov("normal"), self.iterations)
+            self._resolved = (self.iterations, picture)
+        return np.asarray(self._resolved[1])
 
     def _reconstruct(self) -> npt.NDArray[np.float32]:
         """Filtered direct and indirect radiance [2, height, width, 3], computed once per iteration."""
@@ -191,7 +201,8 @@ class Film:
     def aov(self, name: str) -> Image:
         """One of `AOV_NAMES`.
 
-        "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance. "albedo", "normal" (shading, unit), "position"
+        "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance, unless it is
+        denoised. "albedo", "normal" (shading, unit), "position"
         (world) [h, w, 3] and "depth" (along the view, scene units) [h, w] are means over the surface samples of the
         pixel, 0 where there are none; "alpha" [h, w] is the covered share; "prim_id" int32 [h, w] the
         index into `Scene.meshes` that the first iteration saw, -1 for the background.

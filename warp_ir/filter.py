@@ -5,7 +5,6 @@ A neighbour counts if it lies on the same surface and differs by no more than th
 noise goes to zero, so does the filter's bias.
 """
 
-import os
 from typing import Any
 
 import warp as wp
@@ -14,11 +13,11 @@ from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
 
-LEVELS = int(os.environ.get("LV", 4))
+LEVELS = 4
 """Passes; their taps lie 1, 2, 4, ... pixels apart."""
-_SIGMA = wp.constant(float(os.environ.get("SG", 2.0)))  # standard errors by which two estimates of one value may differ
-_NORMAL_POWER = wp.constant(float(os.environ.get("NP", 16.0)))
-_PLANE = wp.constant(float(os.environ.get("PL", 1.0)))  # footprints by which a point may lie off the plane
+_SIGMA = wp.constant(2.0)  # standard errors by which two estimates of one value may differ
+_NORMAL_POWER = wp.constant(16.0)
+_PLANE = wp.constant(1.0)  # footprints by which a point may lie off the plane
 
 
 @wp.struct

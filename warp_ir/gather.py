@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.bvh import _on_cuda
-from warp_ir.device_scene import SceneData
+from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.surface import visible
 from warp_ir.vpl import VplBuffer
@@ -31,9 +31,9 @@ BLOCKS_PER_SET = 16
 MAX_SETS = 64
 _INFINITE = 3.0e38
 _UNBOUNDED = wp.constant(_INFINITE)
-import os
-
-AREA_PER_VPL = float(os.environ.get("C", 8.0))
+_AREAS = 16.0
+"""The bound takes hold within a disk of as many times the area that a VPL stands for. Small: noise from VPLs close
+by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
 
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -50,6 +50,7 @@ class VplSets:
     blocks: int  # per set
     bound: float
     rows: wp.array[vec16]
+    order: wp.array[wp.int32]  # the VPLs, set by set and in each along a space-filling curve
     vpls: VplBuffer
 
 
@@ -95,7 +96,8 @@ def bounded_geometry_term(x: Receiver, position: wp.vec4, normal: wp.vec4, bound
     wp::vec_t<16, float> f;
     for (int i = 0; i < 16; ++i) {
         const float w = b[3][i];
-        const float dx = b[0][i] - x.position[0] * w, dy = b[1][i] - x.position[1] * w, dz = b[2][i] - x.position[2] * w;
+        const float dx = b[0][i] - x.position[0] * w, dy = b[1][i] - x.position[1] * w;
+        const float dz = b[2][i] - x.position[2] * w;
         const float squared = dx * dx + dy * dy + dz * dz + 1.0e-30f;
         const float inverse = 1.0f / sqrtf(squared);
         const float geometric = x.normal[0] * dx + x.normal[1] * dy + x.normal[2] * dz;
@@ -132,10 +134,11 @@ def _sum(v: vec16) -> float: ...
 
 
 @wp.func
-def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, vpl: int, share: float, max_bounce: int) -> Irradiance:
+def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, slot: int, share: float, max_bounce: int) -> Irradiance:
     """What the chosen VPL gives: `share` (= S/M) in the colour of its intensity, if it is visible."""
     out = Irradiance()
-    if vpl < lit.vpls.count:
+    if slot < lit.vpls.count:
+        vpl = lit.order[slot]
         bounce = lit.vpls.bounce[vpl]
         if bounce <= max_bounce and visible(scene, x.position, lit.vpls.position[vpl]):
             intensity = lit.vpls.intensity[vpl]
@@ -192,8 +195,8 @@ def _gather_in_blocks(
     for lane in range(_LANES):
         passed += sums[lane]
         while drawn < rays and (float(drawn) + u[1]) * share < passed:
-            vpl = _LANES * (begin + wp.min(candidate[lane], lit.blocks - 1)) + lane
-            one = _shadowed(scene, lit, x, vpl, share, max_bounce)
+            slot = _LANES * begin + lit.blocks * lane + wp.min(candidate[lane], lit.blocks - 1)
+            one = _shadowed(scene, lit, x, slot, share, max_bounce)
             out.direct += one.direct
             out.indirect += one.indirect
             drawn += 1
@@ -209,17 +212,17 @@ def _gather_one_by_one(
     begin = chosen_set * lit.blocks * _LANES
     end = wp.min(begin + lit.blocks * _LANES, lit.vpls.count)
     total = float(0.0)
-    for vpl in range(begin, end):
-        total += _weigh_one(lit, x, vpl)
+    for slot in range(begin, end):
+        total += _weigh_one(lit, x, slot)
     if total <= 0.0:
         return out
     share = total / float(rays)
     running = float(0.0)
     drawn = int(0)
-    for vpl in range(begin, end):
-        running += _weigh_one(lit, x, vpl)
+    for slot in range(begin, end):
+        running += _weigh_one(lit, x, slot)
         while drawn < rays and (float(drawn) + u[1]) * share < running:
-            one = _shadowed(scene, lit, x, vpl, share, max_bounce)
+            one = _shadowed(scene, lit, x, slot, share, max_bounce)
             out.direct += one.direct
             out.indirect += one.indirect
             drawn += 1
@@ -227,22 +230,47 @@ def _gather_one_by_one(
 
 
 @wp.func
-def _weigh_one(lit: VplSets, x: Receiver, vpl: int) -> float:
+def _weigh_one(lit: VplSets, x: Receiver, slot: int) -> float:
+    vpl = lit.order[slot]
     normal = lit.vpls.normal[vpl]
     bound = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
     return luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
 
 
+@wp.func
+def _spread_bits(x: int) -> int:
+    """Six bits, with two zeros between any two."""
+    y = (x | (x << 8)) & 0x0F00F
+    y = (y | (y << 4)) & 0x0C30C3
+    return (y | (y << 2)) & 0x249249
+
+
+@wp.kernel
+def _sort_key(first: int, lit: VplSets, extent: float, keys: wp.array[wp.int32]) -> None:
+    """Set, then lights before surfaces, then the place on the Z-order curve."""
+    i = first + wp.tid()
+    lit.order[i] = i
+    p = lit.vpls.position[i]
+    code = int(0)
+    for k in range(3):
+        cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
+        code = code | (_spread_bits(cell) << k)
+    surface = wp.where(lit.vpls.bounce[i] > 0, 1, 0)
+    keys[i] = ((i // (lit.blocks * _LANES)) << 19) | (surface << 18) | code
+
+
 @wp.kernel
 def _pack(first: int, lit: VplSets) -> None:
-    """Writes block `i`."""
+    """Writes block `i`: every lane runs along a part of the set's curve of its own."""
     i = first + wp.tid()
+    begin = (i // lit.blocks) * lit.blocks * _LANES
     for lane in range(_LANES):
-        vpl = _LANES * i + lane
+        slot = begin + lit.blocks * lane + i % lit.blocks
         position = wp.vec4(0.0)
         normal = wp.vec4(0.0)
         strength = float(0.0)
-        if vpl < lit.vpls.count:
+        if slot < lit.vpls.count:
+            vpl = lit.order[slot]
             position = lit.vpls.position[vpl]
             normal = lit.vpls.normal[vpl]
             strength = luminance(lit.vpls.intensity[vpl])
@@ -253,16 +281,21 @@ def _pack(first: int, lit: VplSets) -> None:
         lit.rows[_ROWS * i + 9][lane] = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
 
 
-def arrange(vpls: Any, area: float, launcher: Launcher) -> Any:
-    """The `VplSets` of a `VplBuffer` on surfaces of some area in the device's frame, which gives the bound on G."""
+def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> Any:
+    """The `VplSets` of a `VplBuffer`; the area of the scene's surfaces gives the bound on G."""
     lit = VplSets()
     blocks = -(-vpls.count // LANES)
     lit.sets = 1
     while lit.sets < MAX_SETS and blocks >= 2 * lit.sets * BLOCKS_PER_SET:
         lit.sets *= 2
     lit.blocks = -(-blocks // lit.sets)
-    lit.bound = math.pi * max(vpls.count, 1) / (AREA_PER_VPL * area) if area > 0.0 else _INFINITE
+    lit.bound = math.pi * max(vpls.count, 1) / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
     lit.vpls = vpls
+    keys = launcher.empty(max(2 * vpls.count, 1), wp.int32)
+    lit.order = launcher.empty(max(2 * vpls.count, 1), wp.int32)  # the sort wants room for a second copy
+    launcher.launch(_sort_key, vpls.count, [lit, scene.extent, keys])
+    if vpls.count:
+        wp.utils.radix_sort_pairs(keys, lit.order, vpls.count)
     lit.rows = launcher.empty(max(_ROWS * lit.sets * lit.blocks, 1) if not launcher.device.is_cuda else 1, vec16)
     if not launcher.device.is_cuda:
         launcher.launch(_pack, lit.sets * lit.blocks, [lit])

@@ -271,7 +271,7 @@ def lights_along(
 def lights_beyond(
     scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, cosine: float, bound: float
 ) -> wp.vec3:
-    """Radiance of the lights that a unit direction meets before t_max, times the share (1 - bound/G)⁺ that a bound cuts.
+    """Radiance of the lights that a unit direction meets before t_max, times the share (1 - bound/G)⁺ that is cut.
 
     `cosine` is that of the direction at the origin.
     """

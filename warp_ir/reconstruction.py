@@ -8,7 +8,6 @@ Where the result differs from the plain mean by more than the noise explains, th
 with the noise.
 """
 
-import os
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,10 @@ from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
 
-EDGE_RAYS = int(os.environ.get("ER", 16))
+_EDGE_RAYS = (16, 64)
+"""Camera rays for a pixel on an edge: at least, and at most; in between as many as there were iterations."""
 _MATCH = wp.constant(0.2)  # of `same_surface`: below, a sample is not of that surface
-_TRUST = wp.constant(float(os.environ.get("TR", 3.0)))  # standard errors by which the result may differ from the mean
+_TRUST = wp.constant(3.0)  # standard errors by which the result may differ from the mean
 _EDGE_JITTER = wp.constant(wp.uint32(0xBB67AE85))
 
 
@@ -273,7 +273,8 @@ class Reconstruction:
             launcher.launch(_average, pixels, [self._surfaces, self._seen, layer])
             layer = filter_layer(self._surfaces, layer, launcher)
             out = launcher.empty((2, pixels), wp.vec3)
-            weight = wp.vec3(1.0 / iterations, self._exposure, float(EDGE_RAYS))
+            rays = min(max(iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
+            weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
             launcher.launch(
                 _compose, pixels, [self._scene.data, self._camera, self._surfaces, layer, film, weight, out]
             )

@@ -32,6 +32,7 @@ import warp_ir.gather
 import warp_ir.gbuffer
 import warp_ir.reconstruction
 import warp_ir.vpl
+from warp_ir.denoise import require_denoiser
 from warp_ir.device_scene import camera_data, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
@@ -77,6 +78,8 @@ class Renderer:
         """
         height = settings.height or max(1, round(settings.width / scene.camera.aspect))
         self.settings = replace(settings, height=height)  # checks the number of pixels again
+        if settings.denoise:
+            require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
         self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
         self.scene = upload_scene(scene, self.launcher)
@@ -95,7 +98,7 @@ class Renderer:
         assert self.settings.height is not None
         film = Film(self.settings.width, self.settings.height, self.launcher, self.scene.frame)
         film.settings = self.settings
-        if self.settings.filter and self.settings.estimator == "vpl":
+        if self.settings.filter and self.settings.estimator == "vpl" and not self.settings.denoise:
             film.reconstruction = Reconstruction(self.scene, self._camera, self.launcher, self._gbuffer, self._exposure)
         return film
 

@@ -7,7 +7,6 @@ import numpy as np
 import warp_ir as ir
 from warp_ir.scene import LightKind
 
-
 ITERATIONS = {"vpl": 64, "keller": 16, "path": 512}
 """Enough of each estimator for a standard error of about a percent in the scenes of these tests."""
 

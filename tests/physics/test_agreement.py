@@ -18,7 +18,7 @@ def smooth_ball():
     """A smooth-shaded ball in the Cornell box: interpolated normals, and colours by corner."""
     points, triangles = sphere(100.0, level=2)
     normals = (points / 100.0)[triangles].astype(np.float32)
-    ball = mesh("ball", points + [278, 250, 150], triangles)
+    ball = mesh("ball", points + np.array([278, 250, 150]), triangles)
     ball = dataclasses.replace(ball, normals=normals, colors=np.abs(normals))
     scene = cornell_box()
     return dataclasses.replace(scene, meshes=(*scene.meshes, ball))
@@ -84,7 +84,7 @@ def test_standard_error_is_honest(estimator):
 def test_error_falls_as_one_over_root_n(estimator):
     """The log-log slope of the spread over the number of (independent) iterations is -1/2.
 
-    Each spread is of 16 renders, known to 1/√32 or ±18 % at worst; over a factor of 16 the slope is then known to ±0.09.
+    Each spread is of 16 renders, known to 1/√32 or ±18 % at worst; over a factor of 16 the slope is known to ±0.09.
     """
     counts = [4, 16, 64]
     spreads = [repeated(estimator, n)[0].std(axis=0, ddof=1).mean() for n in counts]

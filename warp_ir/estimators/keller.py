@@ -58,7 +58,7 @@ def _accumulate(
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
 ) -> None:
-    """E/π = 1/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others; the film multiplies by ρ."""
+    """E/π = 1/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others; ρ is the film's."""
     pixel = first + wp.tid()
     from_lights = wp.vec3(0.0)
     from_surfaces = wp.vec3(0.0)
