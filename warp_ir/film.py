@@ -151,11 +151,11 @@ class Film:
     def radiance(self) -> npt.NDArray[np.float32]:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
-        The mean of the iterations, its noise filtered or denoised if the settings say so and there are at least two.
+        The mean of the iterations, its noise filtered or denoised if the settings say so.
         """
-        if self.settings is not None and self.settings.denoise and self.iterations > 1:
+        if self.settings is not None and self.settings.denoise and self.iterations > 0:
             return self._denoised()
-        if self.reconstruction is not None and self.iterations > 1:
+        if self.reconstruction is not None and self.iterations > 0:
             direct, indirect = self._reconstruct()
             return np.asarray(direct + indirect)
         return self._mean(*_RADIANCE).astype(np.float32)
@@ -211,7 +211,7 @@ class Film:
             InputError: There is no such AOV.
         """
         shape = (self.height, self.width)
-        if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 1:
+        if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 0:
             return self._reconstruct()[("direct", "indirect").index(name)]
         if name == "direct":
             return self._mean("emission", "direct").astype(np.float32)

@@ -93,6 +93,10 @@ class Launcher:
             command.set_dim(end - begin)
             command.launch()
 
+    def resume(self) -> None:
+        """Takes `cancel` back."""
+        self._cancelled.clear()
+
     def cancel(self) -> None:
         """Abandons the launches in flight as soon as may be; safe from a signal handler or another thread."""
         self._cancelled.set()

@@ -135,6 +135,8 @@ def _interpolate(surfaces: Surfaces, layer: Layer, p: int, u: wp.vec2, point: Si
 @wp.func
 def _uncertainty(surfaces: Surfaces, film: FilmData, p: int, share: float) -> float:
     """Variance of the film's mean at a pixel, averaged over its neighbours: that of few iterations is itself noise."""
+    if share == 1.0:
+        return 1.0e30  # one iteration says nothing about its error
     total = float(0.0)
     weights = float(0.0)
     for dy in range(-1, 2):
@@ -153,14 +155,18 @@ def _uncertainty(surfaces: Surfaces, film: FilmData, p: int, share: float) -> fl
 
 
 @wp.func
-def _on_edge(surfaces: Surfaces, p: int) -> bool:
-    """Whether any of the eight neighbours shows another surface, or none."""
+def _on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
+    """Whether any of the eight neighbours shows another surface, or none, or one that emits differently."""
+    glow = film.emission[p][0] + film.emission[p][1] + film.emission[p][2]
     for dy in range(-1, 2):
         for dx in range(-1, 2):
             x = p % surfaces.columns + dx
             y = p // surfaces.columns + dy
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
+                other = film.emission[q][0] + film.emission[q][1] + film.emission[q][2]
+                if wp.abs(other - glow) > wp.float64(0.01) * wp.max(other, glow):
+                    return True
                 if surfaces.footprint[q] > 0.0 or surfaces.footprint[p] > 0.0:
                     if same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q]) < _MATCH:
                         return True
@@ -189,7 +195,7 @@ def _compose(
     albedo = film.albedo[p] * share
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    if not _on_edge(surfaces, p):
+    if not _on_edge(surfaces, film, p):
         if surfaces.footprint[p] > 0.0 and layer.variance[p] >= 0.0:
             direct = wp.cw_mul(albedo, layer.direct[p]) * weight[1]
             indirect = wp.cw_mul(albedo, layer.indirect[p]) * weight[1]

@@ -132,9 +132,9 @@ def render(
     """
     renderer = Renderer(scene, settings or RenderSettings(), device=device)
     settings = renderer.settings
+    start = time.perf_counter()
     film = renderer.new_film()
     with _signals_cancel(renderer.launcher, film):
-        start = time.perf_counter()
         checked, error = 0, math.nan
         while not film.interrupted:
             try:
@@ -145,14 +145,13 @@ def render(
             # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
             if film.iterations >= max(2, checked + checked // 8 + 1):
                 checked, error = film.iterations, film.error()
-            report = _progress(film, settings, error)
+            report = _progress(film, settings, error, _filter_seconds(renderer, film))
             if progress is not None:
                 progress(report)
             if report.fraction >= 1.0:
                 break
-    start = time.perf_counter()
-    film.radiance()
-    film.seconds += time.perf_counter() - start
+    film.radiance()  # filtered now, and remembered: it belongs to the render and its time
+    film.seconds = time.perf_counter() - start
     film.timings = renderer.launcher.profile.seconds()
     film.counts = {"iterations": film.iterations, **renderer.launcher.profile.counts}
     return film
@@ -191,12 +190,19 @@ def _modules(estimator: str) -> list[Any]:
     return [warp_ir.estimators.path]
 
 
-def _progress(film: Film, settings: RenderSettings, error: float) -> Progress:
-    """What is used up of each limit; the largest share counts."""
+def _filter_seconds(renderer: Renderer, film: Film) -> float:
+    """What filtering the picture will take [s]: about as much as 16 passes of camera rays, edges included."""
+    if film.reconstruction is None:
+        return 0.0
+    return 16.0 * renderer.launcher.profile.seconds().get("primary", 0.0) / film.iterations
+
+
+def _progress(film: Film, settings: RenderSettings, error: float, reserve: float) -> Progress:
+    """What is used up of each limit, `reserve` being the time [s] to keep for the end; the largest share counts."""
     shares = [film.iterations / settings.iteration_limit]
     if settings.time_limit is not None:
         # An iteration that would end beyond the limit is not begun.
-        shares.append(film.seconds * (film.iterations + 1) / film.iterations / settings.time_limit)
+        shares.append((film.seconds * (film.iterations + 1) / film.iterations + reserve) / settings.time_limit)
     if settings.target_error is not None and error > 0.0:
         shares.append((settings.target_error / error) ** 2)
     elif settings.target_error is not None and error == 0.0:
@@ -223,3 +229,4 @@ def _signals_cancel(launcher: Launcher, film: Film) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+        launcher.resume()

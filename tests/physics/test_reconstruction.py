@@ -1,0 +1,99 @@
+"""The filter takes noise away, leaves what is sharp, and in the end leaves the mean alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+from tests.physics.closed_form import render
+from warp_ir.metrics import relative_mse
+from warp_ir.procedural import cornell_box, furnace
+
+
+def rms(a, b):
+    return float(np.sqrt(np.mean((np.asarray(a, np.float64) - b) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """The Cornell box, path traced; its own error is a tenth of what is asked below."""
+    return render(cornell_box(), "path", width=48, height=48, iterations=4096).radiance()
+
+
+def test_it_takes_noise_away(truth, device):
+    """Filtered, two iterations have less than half the error, even in a picture so small that a third of it is edges."""
+    few = render(cornell_box(), "vpl", device, width=48, height=48, iterations=2, filter=True)
+    raw = render(cornell_box(), "vpl", device, width=48, height=48, iterations=2)
+    assert relative_mse(few.radiance(), truth) < 0.5 * relative_mse(raw.radiance(), truth)
+
+
+def test_its_bias_vanishes_with_the_noise(device):
+    """The distance between picture and plain mean is bound by the standard error, and falls with it."""
+    distances = []
+    for iterations in (16, 256):
+        pictures = [
+            render(cornell_box(), "vpl", device, width=32, height=32, iterations=iterations, filter=f).radiance()
+            for f in (False, True)
+        ]
+        distances.append(rms(*pictures))
+    assert distances[1] < 0.5 * distances[0]
+
+
+def test_a_uniform_room_stays_uniform(device):
+    """Where irradiance does not vary the filter changes nothing but the noise."""
+    film = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16, filter=True)
+    raw = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16)
+    assert film.radiance().std() < 0.5 * raw.radiance().std()
+    assert film.radiance().mean() == pytest.approx(2.0, rel=0.01)
+
+
+def test_albedo_and_emission_stay_sharp(device):
+    """Neighbouring pixels of one wall keep their own albedo and emission: only irradiance is shared."""
+    scene = furnace(0.5, 1.0, shape="cube")
+    colors = np.zeros((12, 3, 3), np.float32)
+    colors[::2] = (0.8, 0.2, 0.2)
+    colors[1::2] = (0.2, 0.2, 0.8)
+    scene = dataclasses.replace(scene, meshes=(dataclasses.replace(scene.meshes[0], colors=colors),))
+    film = render(scene, "vpl", device, width=32, height=32, iterations=8, filter=True)
+    albedo, radiance = film.aov("albedo"), film.radiance()
+    inside = (np.abs(albedo[..., 0] - 0.8) < 1e-3) | (np.abs(albedo[..., 0] - 0.2) < 1e-3)
+    irradiance = (radiance[inside] - 1.0) / albedo[inside]
+    assert irradiance.std() / irradiance.mean() < 0.25  # the corners are darker or brighter; mixed albedos gave 0.6
+
+
+def test_direct_and_indirect_add_up(device):
+    """The two parts of a filtered picture are the picture."""
+    film = render(cornell_box(), "vpl", device, iterations=4, filter=True)
+    np.testing.assert_allclose(film.aov("direct") + film.aov("indirect"), film.radiance(), rtol=1e-6)
+
+
+def test_two_films_filter_as_one(device):
+    """Merging adds what the filter has observed, too."""
+    from warp_ir.renderer import Renderer
+
+    settings = ir.RenderSettings(width=16, height=16, light_paths=64)
+    renderer = Renderer(cornell_box(), settings, device=device)
+    whole, one, two = (renderer.new_film() for _ in range(3))
+    for i in range(4):
+        renderer.add_iteration(whole, i)
+        renderer.add_iteration(one if i < 2 else two, i)
+    one.merge(two)
+    np.testing.assert_allclose(one.radiance(), whole.radiance(), rtol=1e-4, atol=1e-7)
+
+
+def test_denoise_needs_its_extra(monkeypatch):
+    """Without the denoiser, asking for it is an error before any work, which says what to install."""
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(ir.InputError, match=r"warp-ir\[denoise\]"):
+        ir.render(cornell_box(), ir.RenderSettings(width=8, height=8, iterations=2, denoise=True))
+
+
+def test_denoised_picture(truth):
+    """Denoised, four iterations are better than the plain mean of them."""
+    pytest.importorskip("pyoidn")
+    raw = render(cornell_box(), "vpl", width=48, height=48, iterations=4)
+    smooth = render(cornell_box(), "vpl", width=48, height=48, iterations=4, denoise=True)
+    assert relative_mse(smooth.radiance(), truth) < relative_mse(raw.radiance(), truth)
