@@ -79,3 +79,12 @@ def test_empty_and_degenerate_meshes_render(triangles):
     for estimator in ("keller", "path"):
         film = ir.render(scene, ir.RenderSettings(width=4, height=4, iterations=1, estimator=estimator))
         assert film.radiance().max() == 0.0
+
+
+def test_a_picture_too_large_for_the_memory_is_refused(monkeypatch):
+    """Before anything is allocated, with the size it would need and the size there is."""
+    from warp_ir.launch import Launcher
+
+    monkeypatch.setattr(Launcher, "memory", lambda self: 2.0**30)
+    with pytest.raises(ir.InputError, match=r"4000 x 4000 pixels need about 6 GiB, cpu has 1"):
+        ir.render(ir.Scene(), ir.RenderSettings(width=4000, height=4000))

@@ -6,6 +6,7 @@ of every kernel of this package is ``first: int``, and its index is ``first + wp
 only what their index owns, so the cut cannot be seen in the result.
 """
 
+import math
 import os
 import threading
 from collections.abc import Iterator, Sequence
@@ -106,6 +107,15 @@ class Launcher:
         """Times what is launched inside under `name`."""
         with self.profile.phase(name):
             yield
+
+    def memory(self) -> float:
+        """Bytes that may be allocated: what is free on a GPU, all there is on a CPU; infinity if unknown."""
+        if self.device.is_cuda:
+            return float(self.device.free_memory)
+        try:
+            return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        except (AttributeError, OSError, ValueError):
+            return math.inf
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""

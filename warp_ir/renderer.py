@@ -40,9 +40,13 @@ from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
 from warp_ir.reconstruction import Reconstruction
 from warp_ir.sampling import iteration_scramble
-from warp_ir.scene import Scene
+from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl import Vpls, emit_vpls, to_host
+
+
+_BYTES_PER_PIXEL = 400
+"""Film, G-buffer and filter, with a margin; `benchmarks/scaling.py` measures it."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,12 @@ class Renderer:
         if settings.denoise:
             require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
+        needed, there = settings.width * height * _BYTES_PER_PIXEL, self.launcher.memory()
+        if needed > there:
+            raise InputError(
+                f"width: {settings.width} x {height} pixels need about {needed / 2**30:.0f} GiB,"
+                f" {self.launcher.device} has {there / 2**30:.0f}"
+            )
         self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
         self.scene = upload_scene(scene, self.launcher)
         self._exposure = scene.camera.exposure

@@ -11,7 +11,7 @@ ESTIMATOR_NAMES = ("vpl", "keller", "path")
 """In the order in which help texts list them; the first is the default."""
 ABSORPTION_NAMES = ("roulette", "fractional")
 MAX_PIXELS = 1 << 28
-"""Above this an image is refused: at ~300 bytes a pixel it would need 80 GB."""
+"""Above this an image is refused on any machine; below, it depends on the memory there is."""
 
 
 def _setting(default: Any, doc: str, choices: tuple[str, ...] = ()) -> Any:
