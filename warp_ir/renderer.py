@@ -44,7 +44,6 @@ from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl import Vpls, emit_vpls, to_host
 
-
 _BYTES_PER_PIXEL = 400
 """Film, G-buffer and filter, with a margin; `benchmarks/scaling.py` measures it."""
 

@@ -22,7 +22,7 @@ def truth():
 
 
 def test_it_takes_noise_away(truth, device):
-    """Filtered, two iterations have less than half the error, even in a picture so small that a third of it is edges."""
+    """Filtered, two iterations have less than half the error, even in a picture that is mostly edges."""
     few = render(cornell_box(), "vpl", device, width=48, height=48, iterations=2, filter=True)
     raw = render(cornell_box(), "vpl", device, width=48, height=48, iterations=2)
     assert relative_mse(few.radiance(), truth) < 0.5 * relative_mse(raw.radiance(), truth)
