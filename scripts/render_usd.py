@@ -27,6 +27,8 @@ def main() -> None:
     film = ir.render(scene, settings, device=args.device)
     ir.write_image(args.output, film)
     print(f"{args.output}: {film.iterations} iterations in {film.seconds:.1f} s, error {100 * film.error():.1f} %")
+    if film.interrupted:
+        sys.exit(128 + film.interrupted)
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def kernels():
 
 @pytest.mark.parametrize("path, kernel", list(kernels()))
 def test_kernels_follow_the_rules(path, kernel):
-    """Private verb, first argument `first`, at most 8 arguments and 70 lines, no adjoint, no atomics, no tiles."""
+    """Private verb, first argument `first`, at most 8 arguments and 75 lines, no adjoint, no atomics, no tiles."""
     arguments = [a.arg for a in kernel.args.args]
     assert kernel.name.startswith("_") and arguments[0] == "first" and len(arguments) <= 8
     assert kernel.end_lineno - kernel.lineno <= 75

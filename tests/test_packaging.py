@@ -47,10 +47,21 @@ def test_readme_render_command_parses():
     assert (ROOT / "scenes_usd" / "cornell_box.usda").is_file()
 
 
-def test_readme_links_lead_somewhere():
-    """Every relative link of the README is a file (the picture and ARCHITECTURE.md included)."""
-    missing = [to for to in re.findall(r"\]\((?!http)([^)#]+)\)", README) if not (ROOT / to).exists()]
-    assert missing == []
+@pytest.mark.parametrize(
+    "name", ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/api.md", "benchmarks/README.md"]
+)
+def test_links_lead_somewhere(name):
+    """Every relative link is a file, pictures included."""
+    path = ROOT / name
+    links = re.findall(r"\]\((?!http)([^)#]+)\)", path.read_text(encoding="utf-8"))
+    assert [to for to in links if not (path.parent / to).exists()] == []
+
+
+def test_pictures_are_small():
+    """A clone stays light."""
+    pictures = [path for path in (ROOT / "docs").iterdir() if path.suffix != ".md"]
+    assert {"cornell_box.png", "vpls.png"} <= {path.name for path in pictures}
+    assert [path.name for path in pictures if path.stat().st_size > 300_000] == []
 
 
 def test_readme_programs_run(tmp_path, monkeypatch):
@@ -63,6 +74,27 @@ def test_readme_programs_run(tmp_path, monkeypatch):
         program = program.replace("width=128, iterations=16", "width=8, iterations=2")
         exec(compile(program, "README.md", "exec"), {})
     assert (tmp_path / "cornell.exr").is_file()
+
+
+def test_api_examples_run(tmp_path, monkeypatch):
+    """The examples run one after the other, and there is one of every public name."""
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes_usd").symlink_to(ROOT / "scenes_usd")
+    names = {}
+    for program in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(compile(program, "docs/api.md", "exec"), names)
+    assert sorted(re.findall(r"^### `(\w+)`$", text, flags=re.MULTILINE)) == warp_ir.__all__
+    for section in text.split("\n### ")[1:]:
+        assert f"ir.{section.split('`')[1]}" in section or section.startswith("`Film`")
+
+
+def test_layout_is_complete():
+    """ARCHITECTURE.md names every module of the package."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    package = ROOT / "warp_ir"
+    missing = [str(path) for path in package.rglob("*.py") if path.name not in text and path.name[:2] != "__"]
+    assert missing == []
 
 
 def test_import_is_light():

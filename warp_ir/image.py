@@ -331,7 +331,8 @@ def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict
 
     known: dict[str, object] = {}
     if not isinstance(source, np.ndarray):
-        known = {**source.settings.to_dict(), "iterations": source.iterations, "seconds": source.seconds}
+        known = {} if source.settings is None else source.settings.to_dict()  # a loaded film has none
+        known |= {"iterations": source.iterations, "seconds": source.seconds}
         known["estimated_error"] = source.error()
     attributes: dict[str, Any] = {"Software": f"warp_ir {__version__}"}
     for name, value in {**known, **metadata}.items():

@@ -173,7 +173,7 @@ def trace_vpls(
 
     Args:
         scene: Where to trace; empty arrays come back if nothing in it emits.
-        settings: `light_paths`, `absorption`, `max_bounces` and `seed` count.
+        settings: `estimator`, `light_paths`, `absorption`, `max_bounces` and `seed` count.
         device: Where to trace them.
         iteration: Which iteration's VPLs.
     """
@@ -184,7 +184,7 @@ def trace_vpls(
         uploaded,
         launcher,
         paths=settings.light_paths,
-        absorption=settings.absorption or "fractional",
+        absorption=settings.path_end,
         max_bounces=settings.max_bounces,
         scramble=iteration_scramble(settings.seed, iteration),
     )

@@ -30,13 +30,15 @@ class RenderSettings:
     target_error: float | None = _setting(
         None, "stop when the estimated relative RMS error of the picture is below this"
     )
-    light_paths: int = _setting(1024, "light paths per iteration; a power of two is best")
+    light_paths: int = _setting(1024, "light paths per iteration, of vpl and keller; a power of two is best")
     max_bounces: int | None = _setting(
         None, "longest chain of reflections: 0 = direct light only, 1 = one more, ...; unlimited by default"
     )
     estimator: str = _setting(ESTIMATOR_NAMES[0], "which algorithm computes the light", ESTIMATOR_NAMES)
     absorption: str | None = _setting(
-        None, "how light paths end; by default what the estimator was published with", ABSORPTION_NAMES
+        None,
+        "how light paths end: fractional as in 1997 (the default of keller) or roulette (of vpl, always of path)",
+        ABSORPTION_NAMES,
     )
     bound_radius: float = _setting(
         0.0,
@@ -71,6 +73,11 @@ class RenderSettings:
         if self.iterations is not None:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
+
+    @property
+    def path_end(self) -> str:
+        """The absorption that holds: as set; else fractional for `keller`, as published, roulette otherwise."""
+        return self.absorption or ("fractional" if self.estimator == "keller" else "roulette")
 
     def _check(self, name: str, good: bool, wanted: str) -> None:
         if not good:

@@ -1,7 +1,7 @@
 """The ways to compute the light. Each is one file with one verb: add one iteration to a film.
 
-An estimator is built as ``Estimator(scene, camera, settings, launcher, size)`` from an uploaded scene, a
-`CameraData` and a (width, height), and then ``estimate(iteration, gbuffer, direct, indirect)`` fills, for
+An estimator is built as ``Estimator(scene, camera, settings, launcher)`` from an uploaded scene and a
+`CameraData`, and then ``estimate(iteration, gbuffer, direct, indirect)`` fills, for
 every pixel, what the camera sees and its irradiance over π by way of the lights and by way of surfaces.
 What it computes depends on these arguments alone.
 """

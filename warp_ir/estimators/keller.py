@@ -97,7 +97,7 @@ class Keller:
                 self._scene,
                 launcher,
                 paths=settings.light_paths,
-                absorption=settings.absorption or "fractional",
+                absorption=settings.path_end,
                 max_bounces=settings.max_bounces,
                 scramble=iteration_scramble(settings.seed, iteration),
             )

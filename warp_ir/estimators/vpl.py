@@ -43,7 +43,6 @@ class GatherSettings:
 
     columns: int  # pixels per row
     scramble: wp.uint32
-    rotation: int  # which set the first pixel takes
     rays: int
     rays_after: int  # where a compensation ray ends
     max_bounces: int
@@ -75,7 +74,9 @@ def _gather_pixels(
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         # Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels.
         index = _spread(pixel % settings.columns) | (_spread(pixel // settings.columns) << 1)
-        chosen_set = (index + settings.rotation) % lit.sets
+        # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
+        order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
+        chosen_set = ((index & (lit.sets - 1)) ^ int(order & wp.uint32(lit.sets - 1))) & (lit.sets - 1)
         x = Receiver()
         x.position = gbuffer.position[pixel]
         x.normal = gbuffer.normal[pixel]
@@ -146,7 +147,7 @@ class VplGatherer:
                 self._scene,
                 launcher,
                 paths=settings.light_paths,
-                absorption=settings.absorption or "roulette",
+                absorption=settings.path_end,
                 max_bounces=settings.max_bounces,
                 scramble=scramble,
             )
@@ -154,7 +155,6 @@ class VplGatherer:
         how = GatherSettings()
         how.columns = self._camera.columns
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
-        how.rotation = scramble % lit.sets
         how.rays, how.rays_after = _SHADOW_RAYS, _SHADOW_RAYS_AFTER
         how.max_bounces = _UNLIMITED if settings.max_bounces is None else settings.max_bounces
         with launcher.phase("gather"):
