@@ -76,7 +76,7 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
         sides = 2.0
         n = wp.where(rest < 0.5, n, -n)
     root = wp.sqrt(u[0])
-    p = offset(scene, triangle, (1.0 - root) * a + root * (1.0 - u[1]) * b + root * u[1] * c, n)
+    p = offset(a, b, c, 1.0 - root, root * (1.0 - u[1]), n)
     out = LightPoint()
     out.density = probability / (0.5 * wp.length(cross) * sides)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)

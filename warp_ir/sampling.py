@@ -98,6 +98,16 @@ def _permute_reversed(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 
 @wp.func
+def _seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
+    """Independent seeds of the permutations of one scramble.
+
+    Two rounds: after one, seeds of two streams still hang together over the scrambles, and so would the
+    coordinates of a point.
+    """
+    return hash_combine(hash_combine(scramble, stream), scramble)
+
+
+@wp.func
 def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> float:
     """Coordinate `dimension` of point `index` of the sequence `scramble`, in [0, 1)."""
     i = wp.uint32(index)
@@ -105,7 +115,7 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
     if dimension >= _DIMENSIONS:
         # Padding: the same dimensions in an order shuffled by another nested permutation (Burley 2020).
         d = dimension % _DIMENSIONS
-        shuffle = hash_combine(scramble, wp.uint32(dimension // _DIMENSIONS) * _OWEN_1)
+        shuffle = _seed(scramble, ~wp.uint32(dimension // _DIMENSIONS))
         i = _reverse_bits(_permute_reversed(_reverse_bits(i), shuffle))
     x = wp.uint32(0)
     column = 32 * d
@@ -114,7 +124,7 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
             x = x ^ matrices[column]
         i = i >> wp.uint32(1)
         column += 1
-    x = _reverse_bits(_permute_reversed(x, hash_combine(scramble, wp.uint32(dimension))))
+    x = _reverse_bits(_permute_reversed(x, _seed(scramble, wp.uint32(dimension))))
     return float(x >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
 
 

@@ -2,8 +2,8 @@
 
 Intersection points come from barycentric coordinates, which keeps their error within a few ulp of the
 triangle's own coordinates however far the ray has come (Wächter and Binder 2019). A ray therefore starts
-8 ulp off the surface, on the side it leaves from: farther than the error, nearer than any detail
-a float can hold, at any scale.
+8 ulp off the surface, on the side it leaves from, and as far from the triangle's edges, behind which the next wall
+may stand: farther than the error, nearer than any detail a float can hold, at any scale.
 """
 
 import warp as wp
@@ -14,6 +14,7 @@ from warp_ir.device_scene import SceneData
 wp.set_module_options({"enable_backward": False})
 
 _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
+_MOST_PULL = wp.constant(1.0e-3)  # a needle thinner than its rounding error has no inside
 _INFINITY = wp.constant(3.0e38)
 
 
@@ -31,13 +32,17 @@ class Hit:
 
 
 @wp.func
-def offset(scene: SceneData, triangle: int, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """A point of a triangle moved off it, to the side of `normal`, by more than its rounding error."""
-    a = scene.points[scene.indices[3 * triangle]]
-    b = scene.points[scene.indices[3 * triangle + 1]]
-    c = scene.points[scene.indices[3 * triangle + 2]]
+def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp.vec3) -> wp.vec3:
+    """The point u a + v b + (1 - u - v) c of a triangle where rays may start: moved by more than its rounding error
+    along `direction`, a sum of unit vectors towards the side the rays leave from, and away from the edges.
+    """
     size = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
-    return point + normal * (size * _EIGHT_ULP)
+    error = size * _EIGHT_ULP
+    longest = wp.sqrt(wp.max(wp.max(wp.length_sq(b - a), wp.length_sq(c - b)), wp.length_sq(a - c)))
+    # Towards the centroid by `error` at an edge, as the lowest of the triangle's heights measures it.
+    pull = wp.min(error * longest / wp.length(wp.cross(b - a, c - a)), _MOST_PULL)
+    inner = a * (u + pull * (1.0 - 3.0 * u)) + b * (v + pull * (1.0 - 3.0 * v))
+    return inner + c * (1.0 - u - v + pull * (3.0 * (u + v) - 2.0)) + direction * error
 
 
 @wp.func
@@ -57,7 +62,8 @@ def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float)
         c = scene.points[scene.indices[3 * hit.triangle + 2]]
         n = wp.normalize(wp.cross(b - a, c - a))
         hit.normal = wp.where(hit.front == 1, n, -n)
-        hit.position = offset(scene, hit.triangle, hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c, hit.normal)
+        # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
+        hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
     return hit
 
 
