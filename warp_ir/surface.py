@@ -33,8 +33,10 @@ class Hit:
 
 @wp.func
 def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp.vec3) -> wp.vec3:
-    """The point u a + v b + (1 - u - v) c of a triangle where rays may start: moved by more than its rounding error
-    along `direction`, a sum of unit vectors towards the side the rays leave from, and away from the edges.
+    """Where rays may start near the point u a + v b + (1 - u - v) c of a triangle.
+
+    It is moved by more than its rounding error away from the triangle's edges, and along `direction`, a sum of unit
+    vectors on the side the rays leave from.
     """
     size = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
     error = size * _EIGHT_ULP
