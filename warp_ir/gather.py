@@ -31,7 +31,7 @@ BLOCKS_PER_SET = 16
 MAX_SETS = 64
 _INFINITE = 3.0e38
 _UNBOUNDED = wp.constant(_INFINITE)
-_AREAS = 16.0
+_AREAS = 8.0
 """The bound takes hold within a disk of as many times the area that a VPL stands for. Small: noise from VPLs close
 by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
 
@@ -48,9 +48,10 @@ class VplSets:
 
     sets: int
     blocks: int  # per set
+    count: int  # VPLs in all sets
     bound: float
     rows: wp.array[vec16]
-    order: wp.array[wp.int32]  # the VPLs, set by set and in each along a space-filling curve
+    order: wp.array[wp.int32]  # their rows in `vpls`, set by set and in each along a space-filling curve
     vpls: VplBuffer
 
 
@@ -61,14 +62,6 @@ class Receiver:
     position: wp.vec3
     normal: wp.vec3  # geometric
     shading_normal: wp.vec3
-
-
-@wp.struct
-class Irradiance:
-    """Irradiance [W m⁻²] by way of the lights themselves, and by way of surfaces."""
-
-    direct: wp.vec3
-    indirect: wp.vec3
 
 
 @wp.func
@@ -134,46 +127,36 @@ def _sum(v: vec16) -> float: ...
 
 
 @wp.func
-def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, slot: int, share: float, max_bounce: int) -> Irradiance:
+def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, slot: int, share: float, max_bounce: int) -> wp.vec3:
     """What the chosen VPL gives: `share` (= S/M) in the colour of its intensity, if it is visible."""
-    out = Irradiance()
-    if slot < lit.vpls.count:
+    if slot < lit.count:
         vpl = lit.order[slot]
-        bounce = lit.vpls.bounce[vpl]
-        if bounce <= max_bounce and visible(scene, x.position, lit.vpls.position[vpl]):
+        if lit.vpls.bounce[vpl] <= max_bounce and visible(scene, x.position, lit.vpls.position[vpl]):
             intensity = lit.vpls.intensity[vpl]
-            irradiance = intensity * (share / luminance(intensity))
-            if bounce == 0:
-                out.direct = irradiance
-            else:
-                out.indirect = irradiance
-    return out
+            return intensity * (share / luminance(intensity))
+    return wp.vec3(0.0)
 
 
 @wp.func
 def gather(
     scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
-) -> Irradiance:
-    """Irradiance at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
+) -> wp.vec3:
+    """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
 
-    `u` in [0, 1)² are the offsets of the two systematic choices; VPLs of more than `max_bounce` reflections are dark.
+    `chosen_set` is taken modulo their number. `u` in [0, 1)² are the offsets of the two systematic choices. VPLs of
+    more than `max_bounce` reflections are dark.
     """
-    out = Irradiance()
+    chosen = chosen_set & (lit.sets - 1)
     if _on_cuda():
-        out = _gather_one_by_one(scene, lit, chosen_set, x, u, rays, max_bounce)
-    else:
-        out = _gather_in_blocks(scene, lit, chosen_set, x, u, rays, max_bounce)
-    scale = float(lit.sets)
-    out.direct = out.direct * scale
-    out.indirect = out.indirect * scale
-    return out
+        return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
+    return _gather_in_blocks(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
 
 
 @wp.func
 def _gather_in_blocks(
     scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
-) -> Irradiance:
-    out = Irradiance()
+) -> wp.vec3:
+    out = wp.vec3(0.0)
     begin = chosen_set * lit.blocks
     sums = vec16()
     for block in range(begin, begin + lit.blocks):
@@ -196,9 +179,7 @@ def _gather_in_blocks(
         passed += sums[lane]
         while drawn < rays and (float(drawn) + u[1]) * share < passed:
             slot = _LANES * begin + lit.blocks * lane + wp.min(candidate[lane], lit.blocks - 1)
-            one = _shadowed(scene, lit, x, slot, share, max_bounce)
-            out.direct += one.direct
-            out.indirect += one.indirect
+            out += _shadowed(scene, lit, x, slot, share, max_bounce)
             drawn += 1
     return out
 
@@ -206,11 +187,11 @@ def _gather_in_blocks(
 @wp.func
 def _gather_one_by_one(
     scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
-) -> Irradiance:
+) -> wp.vec3:
     """The same for a thread without lanes: one running sum, M targets along it."""
-    out = Irradiance()
+    out = wp.vec3(0.0)
     begin = chosen_set * lit.blocks * _LANES
-    end = wp.min(begin + lit.blocks * _LANES, lit.vpls.count)
+    end = wp.min(begin + lit.blocks * _LANES, lit.count)
     total = float(0.0)
     for slot in range(begin, end):
         total += _weigh_one(lit, x, slot)
@@ -222,9 +203,7 @@ def _gather_one_by_one(
     for slot in range(begin, end):
         running += _weigh_one(lit, x, slot)
         while drawn < rays and (float(drawn) + u[1]) * share < running:
-            one = _shadowed(scene, lit, x, slot, share, max_bounce)
-            out.direct += one.direct
-            out.indirect += one.indirect
+            out += _shadowed(scene, lit, x, slot, share, max_bounce)
             drawn += 1
     return out
 
@@ -246,17 +225,16 @@ def _spread_bits(x: int) -> int:
 
 
 @wp.kernel
-def _sort_key(first: int, lit: VplSets, extent: float, keys: wp.array[wp.int32]) -> None:
-    """Set, then lights before surfaces, then the place on the Z-order curve."""
+def _sort_key(first: int, lit: VplSets, begin: int, extent: float, keys: wp.array[wp.int32]) -> None:
+    """Set, then the place on the Z-order curve, for the VPLs from row `begin` on."""
     i = first + wp.tid()
-    lit.order[i] = i
-    p = lit.vpls.position[i]
+    lit.order[i] = begin + i
+    p = lit.vpls.position[begin + i]
     code = int(0)
     for k in range(3):
         cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
         code = code | (_spread_bits(cell) << k)
-    surface = wp.where(lit.vpls.bounce[i] > 0, 1, 0)
-    keys[i] = ((i // (lit.blocks * _LANES)) << 19) | (surface << 18) | code
+    keys[i] = code | ((i // (lit.blocks * _LANES)) << 18)
 
 
 @wp.kernel
@@ -269,7 +247,7 @@ def _pack(first: int, lit: VplSets) -> None:
         position = wp.vec4(0.0)
         normal = wp.vec4(0.0)
         strength = float(0.0)
-        if slot < lit.vpls.count:
+        if slot < lit.count:
             vpl = lit.order[slot]
             position = lit.vpls.position[vpl]
             normal = lit.vpls.normal[vpl]
@@ -281,22 +259,34 @@ def _pack(first: int, lit: VplSets) -> None:
         lit.rows[_ROWS * i + 9][lane] = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
 
 
-def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> Any:
-    """The `VplSets` of a `VplBuffer`; the area of the scene's surfaces gives the bound on G."""
+def _divide(vpls: Any, count: int) -> Any:
+    """`VplSets` for some of the VPLs, still empty: as many sets as a pixel is spared."""
     lit = VplSets()
-    blocks = -(-vpls.count // LANES)
+    blocks = -(-count // LANES)
     lit.sets = 1
     while lit.sets < MAX_SETS and blocks >= 2 * lit.sets * BLOCKS_PER_SET:
         lit.sets *= 2
     lit.blocks = -(-blocks // lit.sets)
-    lit.bound = math.pi * max(vpls.count, 1) / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
-    lit.vpls = vpls
-    keys = launcher.empty(max(2 * vpls.count, 1), wp.int32)
-    lit.order = launcher.empty(max(2 * vpls.count, 1), wp.int32)  # the sort wants room for a second copy
-    launcher.launch(_sort_key, vpls.count, [lit, scene.extent, keys])
-    if vpls.count:
-        wp.utils.radix_sort_pairs(keys, lit.order, vpls.count)
-    lit.rows = launcher.empty(max(_ROWS * lit.sets * lit.blocks, 1) if not launcher.device.is_cuda else 1, vec16)
-    if not launcher.device.is_cuda:
-        launcher.launch(_pack, lit.sets * lit.blocks, [lit])
+    lit.vpls, lit.count = vpls, count
     return lit
+
+
+def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any]:
+    """The `VplSets` of the VPLs on lights and of those on surfaces.
+
+    The area of the scene's surfaces and the number of VPLs that a pixel weighs give the bound on G.
+    """
+    lights, surfaces = _divide(vpls, vpls.on_lights), _divide(vpls, vpls.count - vpls.on_lights)
+    weighed = LANES * max(lights.blocks + surfaces.blocks, 1)
+    for lit, begin in ((lights, 0), (surfaces, vpls.on_lights)):
+        lit.bound = math.pi * weighed / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
+        keys = launcher.empty(max(2 * lit.count, 1), wp.int32)
+        lit.order = launcher.empty(max(2 * lit.count, 1), wp.int32)  # the sort wants room for a second copy
+        launcher.launch(_sort_key, lit.count, [lit, begin, scene.extent, keys])
+        if lit.count:
+            wp.utils.radix_sort_pairs(keys, lit.order, lit.count)
+        rows = 1 if launcher.device.is_cuda else max(_ROWS * lit.sets * lit.blocks, 1)
+        lit.rows = launcher.empty(rows, vec16)
+        if not launcher.device.is_cuda:
+            launcher.launch(_pack, lit.sets * lit.blocks, [lit])
+    return lights, surfaces

@@ -183,7 +183,7 @@ def trace_vpls(
     vpls = emit_vpls(
         uploaded,
         launcher,
-        paths=settings.light_paths,
+        paths=settings.path_count,
         absorption=settings.path_end,
         max_bounces=settings.max_bounces,
         scramble=iteration_scramble(settings.seed, iteration),

@@ -30,7 +30,9 @@ class RenderSettings:
     target_error: float | None = _setting(
         None, "stop when the estimated relative RMS error of the picture is below this"
     )
-    light_paths: int = _setting(1024, "light paths per iteration, of vpl and keller; a power of two is best")
+    light_paths: int | None = _setting(
+        None, "light paths per iteration, 4096 for vpl and 512 for keller by default; a power of two is best"
+    )
     max_bounces: int | None = _setting(
         None, "longest chain of reflections: 0 = direct light only, 1 = one more, ...; unlimited by default"
     )
@@ -55,7 +57,7 @@ class RenderSettings:
         self._check_integer("width", 1)
         self._check_integer("height", 1, optional=True)
         self._check_integer("iterations", 1, optional=True)
-        self._check_integer("light_paths", 1, 1 << 24)
+        self._check_integer("light_paths", 1, 1 << 24, optional=True)
         self._check_integer("max_bounces", 0, optional=True)
         self._check_integer("seed", 0, (1 << 32) - 1)
         for name in ("time_limit", "target_error"):
@@ -73,6 +75,11 @@ class RenderSettings:
         if self.iterations is not None:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
+
+    @property
+    def path_count(self) -> int:
+        """Light paths per iteration: as set; else few for `keller`, to which every VPL at every pixel is a ray."""
+        return self.light_paths or (512 if self.estimator == "keller" else 4096)
 
     @property
     def path_end(self) -> str:

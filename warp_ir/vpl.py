@@ -37,9 +37,13 @@ _UNLIMITED = 2**31 - 1
 
 @wp.struct
 class VplBuffer:
-    """VPLs in the scene's device frame. Positions and normals are homogeneous, as in `lights`."""
+    """VPLs in the scene's device frame, first those on lights, one per path, then those on surfaces, path by path.
+
+    Positions and normals are homogeneous, as in `lights`.
+    """
 
     count: int
+    on_lights: int
     position: wp.array[wp.vec4]
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
@@ -68,23 +72,20 @@ def _trace_paths(
     vpls: VplBuffer,
     lengths: wp.array[wp.int32],
 ) -> None:
-    """Follows path `i`; counts its vertices, or stores them from row offsets[i] on."""
+    """Follows path `i`; counts its reflections, or stores its light in row i and them from paths + offsets[i] on."""
     i = first + wp.tid()
-    slot = int(0)
-    if store == 1:
-        slot = offsets[i]
-    begin = slot
+    begin = settings.paths + offsets[i]
+    slot = begin
 
     u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
     u = sampling.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     share = 1.0 / float(settings.paths)
     if store == 1:
-        vpls.position[slot] = light.position
-        vpls.normal[slot] = light.normal
-        vpls.intensity[slot] = light.intensity * share
-        vpls.bounce[slot] = 0
-    slot += 1
+        vpls.position[i] = light.position
+        vpls.normal[i] = light.normal
+        vpls.intensity[i] = light.intensity * share
+        vpls.bounce[i] = 0
 
     photon = emit(
         scene,
@@ -148,7 +149,7 @@ def emit_vpls(
     max_bounces: int | None,
     scramble: int,
 ) -> Any:
-    """Traces light paths and returns the `VplBuffer` of all their vertices, path by path; none if nothing emits.
+    """Traces light paths and returns the `VplBuffer` of all their vertices; none if nothing emits.
 
     Args:
         scene: The uploaded scene.
@@ -159,7 +160,7 @@ def emit_vpls(
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
     if not scene.emits:
-        return _buffer(launcher, 0)
+        return _buffer(launcher, 0, 0)
     alive = survivors(paths, scene.mean_albedo)
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
@@ -172,19 +173,19 @@ def emit_vpls(
     # Two passes, count and store, give every path its rows without an atomic or a limit on its length.
     lengths = launcher.empty(paths, wp.int32)
     offsets = launcher.zeros(paths + 1, wp.int32)
-    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 0, _buffer(launcher, 0), lengths])
+    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 0, _buffer(launcher, 0, 0), lengths])
     wp.utils.array_scan(lengths, offsets[1:], inclusive=True)
-    vpls = _buffer(launcher, int(offsets[paths:].numpy()[0]))
+    vpls = _buffer(launcher, paths, int(offsets[paths:].numpy()[0]))
     launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 1, vpls, lengths])
     launcher.profile.counts["light_paths"] += paths
     launcher.profile.counts["vpls"] += vpls.count
     return vpls
 
 
-def _buffer(launcher: Launcher, count: int) -> Any:
+def _buffer(launcher: Launcher, on_lights: int, on_surfaces: int) -> Any:
     vpls = VplBuffer()
-    vpls.count = count
-    rows = max(count, 1)
+    vpls.on_lights, vpls.count = on_lights, on_lights + on_surfaces
+    rows = max(vpls.count, 1)
     vpls.position = launcher.empty(rows, wp.vec4)
     vpls.normal = launcher.empty(rows, wp.vec4)
     vpls.intensity = launcher.empty(rows, wp.vec3)

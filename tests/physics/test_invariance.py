@@ -93,13 +93,13 @@ def test_scale_and_position_change_only_rounding(estimator, scale, shift, device
     """Scaled by 1e-4 to 1e6 or moved by 1e5 of its size, a scene is the same picture up to rounding.
 
     Rounding can decide a ray at an edge the other way: allow that for 1 % of the pixels. In `vpl` one VPL more or
-    less shifts what all pixels choose, and so a little of the noise: it may differ by a quarter of what a seed changes.
+    less shifts what all pixels choose, and so a part of the noise: it may differ by half of what a seed changes.
     """
     moved = transformed(room(), np.eye(3) * scale, np.full(3, shift))
     here, there = render(room(), estimator, device).radiance(), render(moved, estimator, device).radiance()
     if estimator == "vpl":
         reseeded = render(room(), estimator, device, seed=1).radiance()
-        assert np.abs(here - there).mean() <= 0.25 * np.abs(here - reseeded).mean()
+        assert np.abs(here - there).mean() <= 0.5 * np.abs(here - reseeded).mean()
         return
     different = np.abs(here - there).max(axis=2) > 2e-3 * here.mean()
     assert different.mean() <= 0.01

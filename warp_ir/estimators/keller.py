@@ -96,7 +96,7 @@ class Keller:
             vpls = emit_vpls(
                 self._scene,
                 launcher,
-                paths=settings.light_paths,
+                paths=settings.path_count,
                 absorption=settings.path_end,
                 max_bounces=settings.max_bounces,
                 scramble=iteration_scramble(settings.seed, iteration),

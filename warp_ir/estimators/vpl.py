@@ -29,9 +29,9 @@ from warp_ir.vpl import emit_vpls
 wp.set_module_options({"enable_backward": False})
 
 _UNLIMITED = 2**31 - 1
-_SHADOW_RAYS = 4
-"""Per pixel and iteration; time times variance is flat from 3 to 8."""
-_SHADOW_RAYS_AFTER = 2
+_SHADOW_RAYS = (2, 3)
+"""Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
+_SHADOW_RAYS_AFTER = (1, 1)
 """Where a compensation ray ends: such light has lost most of its weight."""
 _ROULETTE_DEPTH = wp.constant(2)
 _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the light paths
@@ -43,8 +43,8 @@ class GatherSettings:
 
     columns: int  # pixels per row
     scramble: wp.uint32
-    rays: int
-    rays_after: int  # where a compensation ray ends
+    rays: wp.vec2i  # to lights and to surfaces
+    rays_after: wp.vec2i  # where a compensation ray ends
     max_bounces: int
 
 
@@ -62,7 +62,8 @@ def _gather_pixels(
     first: int,
     scene: SceneData,
     gbuffer: GBuffer,
-    lit: VplSets,
+    lights: VplSets,
+    surfaces: VplSets,
     settings: GatherSettings,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
@@ -76,23 +77,25 @@ def _gather_pixels(
         index = _spread(pixel % settings.columns) | (_spread(pixel // settings.columns) << 1)
         # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
         order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
-        chosen_set = ((index & (lit.sets - 1)) ^ int(order & wp.uint32(lit.sets - 1))) & (lit.sets - 1)
+        chosen_set = (index ^ int(order)) & 63  # of as many sets as there are
         x = Receiver()
         x.position = gbuffer.position[pixel]
         x.normal = gbuffer.normal[pixel]
         x.shading_normal = gbuffer.shading_normal[pixel]
         throughput = wp.vec3(1.0)
-        reach = 1.0 / wp.sqrt(lit.bound)
+        reach = 1.0 / wp.sqrt(lights.bound)
         depth = int(0)
         rays = settings.rays
         while depth <= settings.max_bounces:
             u = sampling.sample_2d(scene.sobol, index, 4 * depth, settings.scramble)
-            e = gather(scene, lit, chosen_set, x, u, rays, settings.max_bounces - depth)
+            bounces = settings.max_bounces - depth
+            by_lights = gather(scene, lights, chosen_set, x, u, rays[0], bounces)
+            by_surfaces = gather(scene, surfaces, chosen_set, x, u, rays[1], bounces)
             if depth == 0:
-                once = e.direct
-                more = e.indirect
+                once = by_lights
+                more = by_surfaces
             else:
-                more += wp.cw_mul(throughput, e.direct + e.indirect)
+                more += wp.cw_mul(throughput, by_lights + by_surfaces)
 
             v = sampling.sample_2d(scene.sobol, index, 4 * depth + 2, settings.scramble)
             direction = sampling.to_cosine_hemisphere(v, x.shading_normal)
@@ -101,11 +104,11 @@ def _gather_pixels(
             cosine = wp.dot(direction, x.shading_normal)
             hit = closest(scene, x.position, direction, reach)
             near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = lights_beyond(scene, x.position, direction, near, cosine, lit.bound)
+            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound)
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-                cut = 1.0 - wp.min(lit.bound / g, 1.0)
+                cut = 1.0 - wp.min(lights.bound / g, 1.0)
                 found += emission(scene, hit) * cut
             found = wp.cw_mul(throughput, found) * wp.pi
             if depth == 0:
@@ -146,20 +149,20 @@ class VplGatherer:
             vpls = emit_vpls(
                 self._scene,
                 launcher,
-                paths=settings.light_paths,
+                paths=settings.path_count,
                 absorption=settings.path_end,
                 max_bounces=settings.max_bounces,
                 scramble=scramble,
             )
-            lit = arrange(vpls, self._scene, launcher)
+            lights, surfaces = arrange(vpls, self._scene, launcher)
         how = GatherSettings()
         how.columns = self._camera.columns
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
-        how.rays, how.rays_after = _SHADOW_RAYS, _SHADOW_RAYS_AFTER
+        how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
         how.max_bounces = _UNLIMITED if settings.max_bounces is None else settings.max_bounces
         with launcher.phase("gather"):
             launcher.launch(
                 _gather_pixels,
                 gbuffer.mesh.shape[0],
-                [self._scene.data, gbuffer, lit, how, direct, indirect],
+                [self._scene.data, gbuffer, lights, surfaces, how, direct, indirect],
             )
