@@ -1,6 +1,7 @@
 """Takes the noise out of an image of irradiance, and only that.
 
-An edge-avoiding à-trous wavelet filter (Dammertz et al. 2010) guided by measured variance (Schied et al. 2017).
+An edge-avoiding à-trous wavelet filter (Dammertz et al. 2010) guided by measured variance (Schied et al. 2017), for
+light that came directly and light that came by way of surfaces apart: the one has shadows, the other hardly any.
 A neighbour counts if it lies on the same surface and differs by no more than the noise explains: as the
 noise goes to zero, so does the filter's bias.
 """
@@ -13,11 +14,10 @@ from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
 
-LEVELS = 4
+LEVELS = 5
 """Passes; their taps lie 1, 2, 4, ... pixels apart."""
-_SIGMA = wp.constant(2.0)  # standard errors by which two estimates of one value may differ
-_NORMAL_POWER = wp.constant(16.0)
-_PLANE = wp.constant(1.0)  # footprints by which a point may lie off the plane
+_SIGMA = wp.constant(3.0)  # standard errors by which two estimates of one value may well differ
+_PLANE = wp.constant(4.0)  # footprints off the plane at which a point belongs to another surface
 
 
 @wp.struct
@@ -33,11 +33,10 @@ class Surfaces:
 
 @wp.struct
 class Layer:
-    """An image of irradiance over π in two parts, with the variance of their mean channel; -1: no value."""
+    """An image of irradiance over π in two parts, each with the variance of its mean channel; -1: no value."""
 
-    direct: wp.array[wp.vec3]
-    indirect: wp.array[wp.vec3]
-    variance: wp.array[wp.float32]
+    direct: wp.array[wp.vec4]
+    indirect: wp.array[wp.vec4]
 
 
 @wp.func
@@ -47,14 +46,25 @@ def mean_channel(v: wp.vec3) -> float:
 
 
 @wp.func
+def _window(x: float) -> float:
+    """A bell of width 1 (Tukey's biweight): no exponential in the inner loop."""
+    y = wp.max(1.0 - x, 0.0)
+    return y * y
+
+
+@wp.func
 def same_surface(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
     """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0."""
-    if surfaces.footprint[p] <= 0.0:
+    footprint = surfaces.footprint[p]
+    if footprint <= 0.0:
         return 0.0
     facing = wp.max(wp.dot(surfaces.normal[p], normal), 0.0)
+    facing *= facing
+    facing *= facing
+    facing *= facing
     apart = position - surfaces.position[p]
     off = wp.max(wp.abs(wp.dot(surfaces.normal[p], apart)), wp.abs(wp.dot(normal, apart)))
-    return wp.pow(facing, _NORMAL_POWER) * wp.exp(-off / (_PLANE * surfaces.footprint[p]))
+    return facing * facing * _window(off / (_PLANE * footprint))
 
 
 @wp.func
@@ -63,48 +73,67 @@ def _tap(k: int) -> float:
     return wp.where(k == 0, 0.375, wp.where(wp.abs(k) == 1, 0.25, 0.0625))
 
 
+@wp.func
+def _alike(a: wp.vec4, b: wp.vec4) -> float:
+    """Whether `b` can be an estimate of the value of `a`, by the noise of `a`: so a spike is mended and not spread."""
+    d = (a[0] + a[1] + a[2] - b[0] - b[1] - b[2]) * (1.0 / 3.0)
+    t = 1.0 + d * d / (2.0 * _SIGMA * _SIGMA * a[3] + 1.0e-30)
+    return 1.0 / (t * t)
+
+
 @wp.kernel
 def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int) -> None:
     """One pass of 5 x 5 taps, `step` pixels apart."""
     p = first + wp.tid()
-    direct = wp.vec3(0.0)
-    indirect = wp.vec3(0.0)
-    variance = float(0.0)
-    weights = float(0.0)
-    value = mean_channel(source.direct[p] + source.indirect[p])
+    here = source.direct[p]
+    there = source.indirect[p]
+    known = here[3] >= 0.0
+    row = p // surfaces.columns
+    column = p - row * surfaces.columns
+    direct = wp.vec4(0.0)
+    indirect = wp.vec4(0.0)
+    weights = wp.vec2(0.0)
+    position = surfaces.position[p]
+    normal = surfaces.normal[p]
     for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            x = p % surfaces.columns + dx * step
-            y = p // surfaces.columns + dy * step
-            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                q = y * surfaces.columns + x
-                if source.variance[q] >= 0.0:
-                    w = _tap(dx) * _tap(dy)
-                    if q != p:
-                        w *= same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
-                        if source.variance[p] >= 0.0:
-                            noise = wp.sqrt(source.variance[p] + source.variance[q])
-                            different = wp.abs(mean_channel(source.direct[q] + source.indirect[q]) - value)
-                            w *= wp.exp(-different / (_SIGMA * noise + 1.0e-30))
-                    direct += w * source.direct[q]
-                    indirect += w * source.indirect[q]
-                    variance += w * w * source.variance[q]
-                    weights += w
-    out.variance[p] = -1.0
-    if weights > 1.0e-6:
-        out.direct[p] = direct / weights
-        out.indirect[p] = indirect / weights
-        out.variance[p] = variance / (weights * weights)
-    else:
-        out.direct[p] = source.direct[p]
-        out.indirect[p] = source.indirect[p]
+        y = row + dy * step
+        if y >= 0 and y < surfaces.rows:
+            for dx in range(-2, 3):
+                x = column + dx * step
+                if x >= 0 and x < surfaces.columns:
+                    q = y * surfaces.columns + x
+                    d = source.direct[q]
+                    if d[3] >= 0.0:
+                        i = source.indirect[q]
+                        w = _tap(dx) * _tap(dy)
+                        a = w
+                        b = w
+                        if q != p:
+                            w *= same_surface(surfaces, q, position, normal)
+                            a = w
+                            b = w
+                            if known:
+                                a *= _alike(here, d)
+                                b *= _alike(there, i)
+                        direct += wp.vec4(d[0] * a, d[1] * a, d[2] * a, d[3] * a * a)
+                        indirect += wp.vec4(i[0] * b, i[1] * b, i[2] * b, i[3] * b * b)
+                        weights += wp.vec2(a, b)
+    out.direct[p] = _normalized(direct, weights[0])
+    out.indirect[p] = _normalized(indirect, weights[1])
+
+
+@wp.func
+def _normalized(sum: wp.vec4, weight: float) -> wp.vec4:
+    if weight < 1.0e-6:
+        return wp.vec4(0.0, 0.0, 0.0, -1.0)
+    k = 1.0 / weight
+    return wp.vec4(sum[0] * k, sum[1] * k, sum[2] * k, sum[3] * k * k)
 
 
 def new_layer(pixels: int, launcher: Launcher) -> Any:
     """An uninitialised `Layer`."""
     layer = Layer()
-    layer.direct, layer.indirect = launcher.empty(pixels, wp.vec3), launcher.empty(pixels, wp.vec3)
-    layer.variance = launcher.empty(pixels, wp.float32)
+    layer.direct, layer.indirect = launcher.empty(pixels, wp.vec4), launcher.empty(pixels, wp.vec4)
     return layer
 
 

@@ -23,8 +23,10 @@ from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
 
-_EDGE_RAYS = (16, 64)
-"""Camera rays for a pixel on an edge: at least, and at most; in between as many as there were iterations."""
+_EDGE_RAYS = (16, 256)
+"""Camera rays for a pixel on an edge: at least, and at most; in between four for each iteration."""
+_PROBES = wp.constant(8)  # of them, to see whether the edge is in the pixel
+_PRIOR = wp.constant(8.0)  # samples of its own that outweigh what the neighbours say about a pixel's noise
 _MATCH = wp.constant(0.2)  # of `same_surface`: below, a sample is not of that surface
 _TRUST = wp.constant(3.0)  # standard errors by which the result may differ from the mean
 _EDGE_JITTER = wp.constant(wp.uint32(0xBB67AE85))
@@ -36,7 +38,7 @@ class Observations:
 
     direct: wp.array[wp.vec3]
     indirect: wp.array[wp.vec3]
-    squares: wp.array[wp.float32]  # of the mean channel
+    squares: wp.array[wp.vec2]  # of the two mean channels
     count: wp.array[wp.int32]
 
 
@@ -65,42 +67,54 @@ def _observe(
     p = first + wp.tid()
     if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
         if same_surface(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]) > _MATCH:
-            value = mean_channel(direct[p] + indirect[p])
-            if wp.isfinite(value):
+            d = mean_channel(direct[p])
+            i = mean_channel(indirect[p])
+            if wp.isfinite(d) and wp.isfinite(i):
                 seen.direct[p] += direct[p]
                 seen.indirect[p] += indirect[p]
-                seen.squares[p] += value * value
+                seen.squares[p] += wp.vec2(d * d, i * i)
                 seen.count[p] += 1
 
 
 @wp.kernel
 def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> None:
-    """Means, and the variance of them: that of single samples, averaged over the surface nearby, over their number."""
+    """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours."""
     p = first + wp.tid()
-    variance = float(0.0)
+    row = p // surfaces.columns
+    column = p - row * surfaces.columns
+    spread = wp.vec2(0.0)
     weights = float(0.0)
-    for dy in range(-3, 4):
-        for dx in range(-3, 4):
-            x = p % surfaces.columns + dx
-            y = p // surfaces.columns + dy
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            x = column + 2 * dx
+            y = row + 2 * dy
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
-                n = float(seen.count[q])
-                if n > 1.0:
+                if seen.count[q] > 1:
                     w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
-                    mean = mean_channel(seen.direct[q] + seen.indirect[q]) / n
-                    variance += w * wp.max(seen.squares[q] / n - mean * mean, 0.0) * n
-                    weights += w * (n - 1.0)
+                    spread += w * _spread(seen, q)
+                    weights += w * float(seen.count[q] - 1)
     n = float(seen.count[p])
-    out.direct[p] = wp.vec3(0.0)
-    out.indirect[p] = wp.vec3(0.0)
-    out.variance[p] = -1.0
+    out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     if n > 0.0:
-        out.direct[p] = seen.direct[p] / n
-        out.indirect[p] = seen.indirect[p] / n
+        direct = seen.direct[p] / n
+        indirect = seen.indirect[p] / n
         # Alone on its surface: as uncertain as it is bright.
-        single = mean_channel(out.direct[p] + out.indirect[p])
-        out.variance[p] = wp.where(weights > 1.0e-6, variance / wp.max(weights, 1.0e-6), single * single) / n
+        single = wp.vec2(mean_channel(direct), mean_channel(indirect))
+        variance = wp.cw_mul(single, single)
+        if weights > 1.0e-6:
+            variance = (_PRIOR * spread / weights + _spread(seen, p)) / (_PRIOR + n - 1.0)
+        out.direct[p] = wp.vec4(direct[0], direct[1], direct[2], variance[0] / n)
+        out.indirect[p] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1] / n)
+
+
+@wp.func
+def _spread(seen: Observations, q: int) -> wp.vec2:
+    """Sums of the squared deviations from the means."""
+    d = mean_channel(seen.direct[q])
+    i = mean_channel(seen.indirect[q])
+    return wp.max(seen.squares[q] - wp.vec2(d * d, i * i) / float(seen.count[q]), wp.vec2(0.0))
 
 
 @wp.struct
@@ -113,22 +127,45 @@ class _Lit:
 
 
 @wp.func
-def _interpolate(surfaces: Surfaces, layer: Layer, p: int, u: wp.vec2, point: Sight) -> _Lit:
-    """Irradiance at a point seen through (u, v) of pixel `p`, from the pixels around that show its surface."""
+def _color(v: wp.vec4) -> wp.vec3:
+    return wp.vec3(v[0], v[1], v[2])
+
+
+@wp.func
+def _add_neighbor(surfaces: Surfaces, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: _Lit) -> _Lit:
+    """Adds the irradiance of pixel `q`, if it shows the surface of a point seen `away` from its centre [pixels]."""
+    out = lit
+    direct = layer.direct[q]
+    if direct[3] >= 0.0:
+        fit = same_surface(surfaces, q, point.position, point.shading_normal)
+        if fit > _MATCH:
+            w = fit / (0.25 + wp.dot(away, away))
+            out.direct += w * _color(direct)
+            out.indirect += w * _color(layer.indirect[q])
+            out.weight += w
+    return out
+
+
+@wp.func
+def _interpolate(surfaces: Surfaces, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> _Lit:
+    """Irradiance at a point seen through (u, v) of a pixel: from the four pixels around that show its surface.
+
+    Or from any of the nine, if none of the four does.
+    """
     lit = _Lit()
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            x = p % surfaces.columns + dx
-            y = p // surfaces.columns + dy
-            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                q = y * surfaces.columns + x
-                fit = same_surface(surfaces, q, point.position, point.shading_normal)
-                if fit > _MATCH and layer.variance[q] >= 0.0:
-                    away = wp.vec2(u[0] - 0.5 - float(dx), u[1] - 0.5 - float(dy))
-                    w = fit * wp.exp(-2.0 * wp.dot(away, away))
-                    lit.direct += w * layer.direct[q]
-                    lit.indirect += w * layer.indirect[q]
-                    lit.weight += w
+    nearest_x = wp.where(u[0] < 0.5, -1, 1)
+    nearest_y = wp.where(u[1] < 0.5, -1, 1)
+    for ring in range(2):
+        if lit.weight == 0.0:
+            for dy in range(-1, 2):
+                for dx in range(-1, 2):
+                    x = column + dx
+                    y = row + dy
+                    near = dx != -nearest_x and dy != -nearest_y
+                    inside = x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows
+                    if inside and near == (ring == 0):
+                        away = wp.vec2(u[0] - 0.5 - float(dx), u[1] - 0.5 - float(dy))
+                        lit = _add_neighbor(surfaces, layer, y * surfaces.columns + x, away, point, lit)
     return lit
 
 
@@ -137,6 +174,7 @@ def _uncertainty(surfaces: Surfaces, film: FilmData, p: int, share: float) -> fl
     """Variance of the film's mean at a pixel, averaged over its neighbours: that of few iterations is itself noise."""
     if share == 1.0:
         return 1.0e30  # one iteration says nothing about its error
+    n = 1.0 / share
     total = float(0.0)
     weights = float(0.0)
     for dy in range(-1, 2):
@@ -145,7 +183,7 @@ def _uncertainty(surfaces: Surfaces, film: FilmData, p: int, share: float) -> fl
             y = p // surfaces.columns + dy
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
-                w = wp.where(dx == 0 and dy == 0, 4.0, 1.0)
+                w = wp.where(dx == 0 and dy == 0, n + 2.0, 1.0)
                 for c in range(3):
                     mean = (film.emission[q][c] + film.direct[q][c] + film.indirect[q][c]) * wp.float64(share)
                     spread = film.squares[q][c] * wp.float64(share) - mean * mean
@@ -196,9 +234,9 @@ def _compose(
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
     if not _on_edge(surfaces, film, p):
-        if surfaces.footprint[p] > 0.0 and layer.variance[p] >= 0.0:
-            direct = wp.cw_mul(albedo, layer.direct[p]) * weight[1]
-            indirect = wp.cw_mul(albedo, layer.indirect[p]) * weight[1]
+        if surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
+            direct = wp.cw_mul(albedo, _color(layer.direct[p])) * weight[1]
+            indirect = wp.cw_mul(albedo, _color(layer.indirect[p])) * weight[1]
         else:
             direct = raw_direct
             indirect = raw_indirect
@@ -206,17 +244,30 @@ def _compose(
         # The mean irradiance of the pixel itself, for what none of the neighbours shows.
         own_direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
         own_indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
-        rays = int(weight[2])
+        rays = int(0)
+        mixed = bool(False)
         scramble = sampling.hash_combine(wp.uint32(p), _EDGE_JITTER)
+        row = p // camera.columns
+        column = p - row * camera.columns
         glow = wp.vec3(0.0)
-        for k in range(rays):
-            u = sampling.sample_2d(scene.sobol, k, 0, scramble)
-            x = (float(p % camera.columns) + u[0]) / float(camera.columns)
-            y = (float(p // camera.columns) + u[1]) / float(camera.rows)
+        first_albedo = wp.vec3(0.0)
+        first_glow = wp.vec3(0.0)
+        while rays < int(weight[2]) and (mixed or rays < _PROBES):
+            u = sampling.sample_2d(scene.sobol, rays, 0, scramble)
+            x = (float(column) + u[0]) / float(camera.columns)
+            y = (float(row) + u[1]) / float(camera.rows)
             point = see(scene, camera, camera_ray(camera, x, y))
+            if rays == 0:
+                first_albedo = point.albedo
+                first_glow = point.emission
             glow += point.emission
+            # Of one surface, the pixel needs no more rays: the edge lies in its neighbour.
+            mixed = mixed or wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_glow) > 0.0
+            mixed = mixed or point.mesh < 0 or surfaces.footprint[p] <= 0.0
+            mixed = mixed or same_surface(surfaces, p, point.position, point.shading_normal) < _MATCH
+            rays += 1
             if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
-                lit = _interpolate(surfaces, layer, p, u, point)
+                lit = _interpolate(surfaces, layer, row, column, u, point)
                 if lit.weight > 0.0:
                     direct += wp.cw_mul(point.albedo, lit.direct) * (weight[1] / lit.weight)
                     indirect += wp.cw_mul(point.albedo, lit.indirect) * (weight[1] / lit.weight)
@@ -258,7 +309,7 @@ class Reconstruction:
             self._surfaces = surfaces
             self._seen = Observations()
             self._seen.direct, self._seen.indirect = launcher.zeros(pixels, wp.vec3), launcher.zeros(pixels, wp.vec3)
-            self._seen.squares = launcher.zeros(pixels, wp.float32)
+            self._seen.squares = launcher.zeros(pixels, wp.vec2)
             self._seen.count = launcher.zeros(pixels, wp.int32)
 
     def observe(self, gbuffer: Any, direct: Any, indirect: Any) -> None:
@@ -279,7 +330,7 @@ class Reconstruction:
             launcher.launch(_average, pixels, [self._surfaces, self._seen, layer])
             layer = filter_layer(self._surfaces, layer, launcher)
             out = launcher.empty((2, pixels), wp.vec3)
-            rays = min(max(iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
+            rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
             launcher.launch(
                 _compose, pixels, [self._scene.data, self._camera, self._surfaces, layer, film, weight, out]
