@@ -21,7 +21,7 @@ _MOST_TRIANGLES = 200_000_000
 
 
 def build_meshes(
-    sites: Sequence[Site], time: Usd.TimeCode, report: Report
+    sites: Sequence[Site], time: Usd.TimeCode, report: Report, levels: int = 0
 ) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
     """All meshes in the world, one per gprim with all its copies, and the materials they use.
 
@@ -29,18 +29,19 @@ def build_meshes(
         sites: The gprims and where they are drawn.
         time: Of the values.
         report: Where troubles go.
+        levels: How often subdivision surfaces are refined.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    return _Builder(time, report).run(sites)
+    return _Builder(time, report, levels).run(sites)
 
 
 class _Builder:
     """From gprims to meshes and the materials they use."""
 
-    def __init__(self, time: Usd.TimeCode, report: Report) -> None:
-        self._time, self._report = time, report
+    def __init__(self, time: Usd.TimeCode, report: Report, levels: int) -> None:
+        self._time, self._report, self._levels = time, report, levels
         self._table = MaterialTable(time, report)
         self._shapes: dict[Sdf.Path, Shape | None] = {}
 
@@ -78,8 +79,9 @@ class _Builder:
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if kind in IMPLICIT:
             return read_implicit(prim, kind, self._time)
-        read = read_tet_mesh if kind == "TetMesh" else read_mesh
-        return read(prim, self._time, self._report)
+        if kind == "TetMesh":
+            return read_tet_mesh(prim, self._time, self._report)
+        return read_mesh(prim, self._time, self._report, self._levels)
 
     def _mesh(self, site: Site, shape: Shape) -> Mesh | None:
         """A gprim in all its places as one mesh."""

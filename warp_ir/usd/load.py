@@ -32,6 +32,8 @@ _COUNTED = (
     "composition_errors",
 )
 """Counts that `Scene.stats` always has, in this order."""
+_LEVELS = {"low": 0, "medium": 1, "high": 2, "veryhigh": 3}
+"""How often `complexity` refines a subdivision surface, as usdrecord's complexities 1.0 to 1.3 do."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 
@@ -41,6 +43,7 @@ def load_usd(
     camera: str | None = None,
     time: float | None = None,
     purposes: Sequence[str] = ("default", "render"),
+    complexity: str = "low",
     default_light: str = "dome",
     strict: bool = False,
 ) -> Scene:
@@ -54,6 +57,8 @@ def load_usd(
             else the first, else one that frames the scene.
         time: Time code; None: the stage's start.
         purposes: Which of default, render, proxy and guide to draw.
+        complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
+            after one, two and three levels of refinement.
         default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
         strict: Whether the first warning is an error.
 
@@ -64,6 +69,8 @@ def load_usd(
     source = os.fspath(path)
     if isinstance(purposes, str) or not set(purposes) <= set(_PURPOSES):
         raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
+    if complexity not in _LEVELS:
+        raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
     if default_light not in ("dome", "none"):
         raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
     if time is not None and not math.isfinite(time):
@@ -71,7 +78,7 @@ def load_usd(
     report = Report(source, strict=strict)
     with quiet():
         stage = open_stage(source, report)
-        return _load(stage, time_code(stage, time), camera, purposes, default_light, report)
+        return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
 
 
 def _load(
@@ -79,6 +86,7 @@ def _load(
     time: Usd.TimeCode,
     camera: str | None,
     purposes: Sequence[str],
+    levels: int,
     default_light: str,
     report: Report,
 ) -> Scene:
@@ -86,7 +94,7 @@ def _load(
     view = None if chosen is None else read_camera(chosen, time, report)
     axis = up_axis(stage, report)
     found = walk(stage, time, purposes, report)
-    meshes, materials = build_meshes(found.shapes, time, report)
+    meshes, materials = build_meshes(found.shapes, time, report, levels)
     lights = _lights(found.lights, time, report)
     if not meshes:
         hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""

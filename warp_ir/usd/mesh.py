@@ -8,15 +8,24 @@ from pxr import Usd, UsdGeom, UsdSkel
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import primvar, value
 from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.shape import Mask, Shape, cross_products, without_slivers
+from warp_ir.usd.shape import Mask, Shape, elements_of, shaded, without_slivers
+from warp_ir.usd.subdivide import Scheme
+from warp_ir.usd.subdivision import read_subdivided
 from warp_ir.usd.triangulate import triangulate
 
 
-def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
+def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 0) -> Shape | None:
     """The triangles of a Mesh; None if it has no faces.
+
+    Args:
+        prim: The mesh.
+        time: Of the values.
+        report: Where troubles go.
+        levels: How often a subdivision surface is refined; 0 draws its cage.
 
     Raises:
         Unreadable: An array has the wrong type, or counts, indices and points do not belong together.
+        InputError: Subdivision would make more triangles than can be held.
     """
     mesh = UsdGeom.Mesh(prim)
     points = value.floats(mesh.GetPointsAttr(), time, 3)
@@ -32,12 +41,18 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | Non
         if not inside.all():
             report.warn(prim.GetPath(), "{n} hole indices out of range ignored", int((~inside).sum()))
         keep[holes[inside]] = False
-    keep &= _finite_faces(prim, points, counts, indices, report)
+    finite = _finite_faces(prim, points, counts, indices, report)
+    keep &= finite
+    token = value.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark")
+    if token != UsdGeom.Tokens.none:
+        if levels and token in (scheme.value for scheme in Scheme):
+            return read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+        report.warn(
+            prim.GetPath(), "subdivision surface rendered as its cage; a higher complexity refines it ({n} in all)"
+        )
     corner, face = triangulate(points, counts, indices, keep)
     if value.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    if value.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark") != UsdGeom.Tokens.none:
-        report.warn(prim.GetPath(), "subdivision surface rendered as its cage ({n} in all)")
     if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetJointIndicesPrimvar().HasValue():
         report.warn(prim.GetPath(), "skinning is not read yet: the mesh is in its rest pose ({n} in all)")
     shape = Shape(
@@ -45,12 +60,7 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | Non
         triangles=indices.astype(np.int32)[corner],
         face=face,
         corner=corner,
-        elements={
-            "uniform": len(counts),
-            "vertex": len(points),
-            "varying": len(points),
-            "faceVarying": len(indices),
-        },
+        elements=elements_of(points, counts, indices),
     )
     return _finished(prim, shape, int(keep.sum()), time, report)
 
@@ -67,22 +77,17 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
     if points is not None and (faces is None or len(faces) == 0):
         cells = value.ints(tets.GetTetVertexIndicesAttr(), time, 4)
         if cells is not None and len(cells):
-            _check_range(cells, len(points), "tetVertexIndices")
+            value.check_range(cells, len(points), "tetVertexIndices")
             faces = np.asarray(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, time), dtype=np.int64).reshape(-1, 3)
     if points is None or faces is None or len(faces) == 0:
         return None
-    _check_range(faces, len(points), "surfaceFaceVertexIndices")
+    value.check_range(faces, len(points), "surfaceFaceVertexIndices")
     counts = np.full(len(faces), 3)
     keep = _finite_faces(prim, points, counts, faces.reshape(-1), report)
     corner, face = triangulate(points, counts, faces.reshape(-1), keep)
     if value.text(tets.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    elements = {
-        "uniform": len(faces),
-        "vertex": len(points),
-        "varying": len(points),
-        "faceVarying": faces.size,
-    }
+    elements = elements_of(points, counts, faces.reshape(-1))
     shape = Shape(points, faces.reshape(-1).astype(np.int32)[corner], face, corner, elements=elements)
     return _finished(prim, shape, int(keep.sum()), time, report)
 
@@ -92,13 +97,7 @@ def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
         raise Unreadable("faceVertexCounts has negative values")
     if counts.sum() != len(indices):
         raise Unreadable(f"faceVertexCounts add up to {counts.sum()}, but faceVertexIndices has {len(indices)}")
-    _check_range(indices, len(points), "faceVertexIndices")
-
-
-def _check_range(indices: Ints, count: int, name: str) -> None:
-    if indices.size and (indices.min() < 0 or indices.max() >= count):
-        worst = indices.min() if indices.min() < 0 else indices.max()
-        raise Unreadable(f"{name} refers to point {worst} of {count}")
+    value.check_range(indices, len(points), "faceVertexIndices")
 
 
 def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, report: Report) -> Mask:
@@ -139,11 +138,4 @@ def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Repo
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{trouble}; the mesh is faceted")
         return shape
-    geometric = cross_products(shape.points, shape.triangles)
-    geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    usable = np.isfinite(length) & (length > 1e-12)
-    normals = np.where(usable, normals / np.where(usable, length, 1.0), geometric[:, None])
-    if (np.einsum("mci,mi->mc", normals, geometric) > 1.0 - 1e-6).all():
-        return shape
-    return replace(shape, normals=normals.astype(np.float32))
+    return shaded(shape, normals)
