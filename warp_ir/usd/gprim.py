@@ -14,6 +14,7 @@ from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Shape, cross_products, place, without_slivers
+from warp_ir.usd.skel import Skinning, sharing_key
 from warp_ir.usd.walk import Site
 
 _MOST_TRIANGLES = 200_000_000
@@ -43,7 +44,8 @@ class _Builder:
     def __init__(self, time: Usd.TimeCode, report: Report, levels: int) -> None:
         self._time, self._report, self._levels = time, report, levels
         self._table = MaterialTable(time, report)
-        self._shapes: dict[Sdf.Path, Shape | None] = {}
+        self._skinning = Skinning(time, report)
+        self._shapes: dict[tuple[Sdf.Path, ...], Shape | None] = {}
 
     def run(self, sites: Sequence[Site]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
         self._table.resolve([site.prim for site in sites])
@@ -62,7 +64,8 @@ class _Builder:
 
     def _shape(self, prim: Usd.Prim) -> Shape | None:
         """The prim's triangles in its own space; instances of the same prototype share them."""
-        key = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        key = (shared, *sharing_key(prim))
         if key not in self._shapes:
             try:
                 shape = self._read(prim)
@@ -81,7 +84,7 @@ class _Builder:
             return read_implicit(prim, kind, self._time)
         if kind == "TetMesh":
             return read_tet_mesh(prim, self._time, self._report)
-        return read_mesh(prim, self._time, self._report, self._levels)
+        return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
     def _mesh(self, site: Site, shape: Shape) -> Mesh | None:
         """A gprim in all its places as one mesh."""

@@ -3,18 +3,21 @@
 from dataclasses import replace
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import primvar, value
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, elements_of, shaded, without_slivers
+from warp_ir.usd.skel import Pose, Skinning
 from warp_ir.usd.subdivide import Scheme
 from warp_ir.usd.subdivision import read_subdivided
 from warp_ir.usd.triangulate import triangulate
 
 
-def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 0) -> Shape | None:
+def read_mesh(
+    prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 0, skinning: Skinning | None = None
+) -> Shape | None:
     """The triangles of a Mesh; None if it has no faces.
 
     Args:
@@ -22,6 +25,7 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 
         time: Of the values.
         report: Where troubles go.
         levels: How often a subdivision surface is refined; 0 draws its cage.
+        skinning: Deforms meshes that are bound to a skeleton; None leaves them at rest.
 
     Raises:
         Unreadable: An array has the wrong type, or counts, indices and points do not belong together.
@@ -34,6 +38,9 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 
     if points is None or counts is None or indices is None or len(counts) == 0:
         return None
     _check_topology(points, counts, indices)
+    pose = None if skinning is None else skinning.pose(prim, points)
+    if pose is not None:
+        points = pose.points
     keep = np.ones(len(counts), dtype=bool)
     holes = value.ints(mesh.GetHoleIndicesAttr(), time)
     if holes is not None:
@@ -53,8 +60,6 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 
     corner, face = triangulate(points, counts, indices, keep)
     if value.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetJointIndicesPrimvar().HasValue():
-        report.warn(prim.GetPath(), "skinning is not read yet: the mesh is in its rest pose ({n} in all)")
     shape = Shape(
         points=points,
         triangles=indices.astype(np.int32)[corner],
@@ -62,7 +67,7 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 
         corner=corner,
         elements=elements_of(points, counts, indices),
     )
-    return _finished(prim, shape, int(keep.sum()), time, report)
+    return _finished(prim, shape, int(keep.sum()), time, report, pose)
 
 
 def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
@@ -114,14 +119,16 @@ def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, r
     return keep
 
 
-def _finished(prim: Usd.Prim, shape: Shape, wanted: int, time: Usd.TimeCode, report: Report) -> Shape:
+def _finished(
+    prim: Usd.Prim, shape: Shape, wanted: int, time: Usd.TimeCode, report: Report, pose: Pose | None = None
+) -> Shape:
     """The shape without slivers and with its normals; of the `wanted` faces, those that vanished are counted."""
     shape = without_slivers(shape)
     lost = wanted - int(np.count_nonzero(np.bincount(shape.face))) if len(shape.face) else wanted
-    return _with_normals(prim, replace(shape, degenerate=lost), time, report)
+    return _with_normals(prim, replace(shape, degenerate=lost), time, report, pose)
 
 
-def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Shape:
+def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report, pose: Pose | None) -> Shape:
     """The shape with its authored normals; without any, or if they say no more than the winding, faceted."""
     authored = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     if authored and authored.HasValue():
@@ -138,4 +145,4 @@ def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Repo
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{trouble}; the mesh is faceted")
         return shape
-    return shaded(shape, normals)
+    return shaded(shape, normals if pose is None else pose.normals(normals, shape.triangles))
