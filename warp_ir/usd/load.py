@@ -5,14 +5,15 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pxr import Usd
+import numpy as np
+from pxr import Tf, Usd
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.stage import open_stage, quiet, time_code, up_axis
+from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
 from warp_ir.usd.walk import Site, walk
 
 _COUNTED = (
@@ -76,9 +77,13 @@ def load_usd(
     if time is not None and not math.isfinite(time):
         raise InputError(f"time: {time} is not a finite number")
     report = Report(source, strict=strict)
-    with quiet():
+    # Any number in a file may be NaN or huge; readers look at what they compute, NumPy need not say it first.
+    with quiet(), np.errstate(all="ignore"):
         stage = open_stage(source, report)
-        return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
+        try:
+            return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
+        except Tf.ErrorException as error:  # damage that shows only when the value is unpacked
+            raise InputError(f"{source}: cannot be read: {first_message(error)}") from None
 
 
 def _load(

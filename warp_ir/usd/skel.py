@@ -164,7 +164,8 @@ class Skinning:
     ) -> Pose:
         """The points as the skeleton moves them, by linear blending or with dual quaternions."""
         binds = bones.GetSkeleton().GetBindTransformsAttr().Get()
-        if binds is None or len(binds) != len(bones.GetJointOrder()):  # USD would take what is not there
+        if not isinstance(binds, Vt.Matrix4dArray) or len(binds) != len(bones.GetJointOrder()):
+            # USD itself would take what is not there.
             raise Unreadable(f"its skeleton {bones.GetPrim().GetPath()} has not one bind transform for each joint")
         joints = bones.ComputeSkinningTransforms(self._time)
         mapper = query.GetJointMapper()
