@@ -32,7 +32,7 @@ def read_mesh(
         InputError: Subdivision would make more triangles than can be held.
     """
     mesh = UsdGeom.Mesh(prim)
-    points = value.floats(mesh.GetPointsAttr(), time, 3)
+    points = _points(mesh, time, report)
     counts = value.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = value.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
@@ -77,7 +77,7 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points = value.floats(tets.GetPointsAttr(), time, 3)
+    points = _points(tets, time, report)
     faces = value.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
     if points is not None and (faces is None or len(faces) == 0):
         cells = value.ints(tets.GetTetVertexIndicesAttr(), time, 4)
@@ -95,6 +95,52 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
     elements = elements_of(points, counts, faces.reshape(-1))
     shape = Shape(points, faces.reshape(-1).astype(np.int32)[corner], face, corner, elements=elements)
     return _finished(prim, shape, int(keep.sum()), time, report)
+
+
+def _points(shape: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> Floats | None:
+    """The points [n, 3]: where velocities carry them from the sample before, else interpolated by USD.
+
+    Velocities make sense of a cache whose topology changes from sample to sample, where nothing can be interpolated.
+    """
+    attribute, velocities = shape.GetPointsAttr(), shape.GetVelocitiesAttr()
+    points = value.floats(attribute, time, 3)
+    if points is None or time.IsDefault() or not velocities.HasAuthoredValue():
+        return points
+    bracket = _bracket(attribute, time)
+    if bracket is None or bracket[0] == time.GetValue():
+        return points
+    seconds: float = (time.GetValue() - bracket[0]) / shape.GetPrim().GetStage().GetTimeCodesPerSecond()
+    try:
+        moved = value.floats(attribute, Usd.TimeCode(bracket[0]), 3)
+        if moved is None or _bracket(velocities, time) != bracket:
+            return points
+        velocity = _rates(velocities, bracket[0], len(moved))
+        if _bracket(shape.GetAccelerationsAttr(), time) == bracket:
+            velocity = velocity + 0.5 * seconds * _rates(shape.GetAccelerationsAttr(), bracket[0], len(moved))
+    except Unreadable as trouble:
+        report.warn(shape.GetPath(), f"{trouble}; the points are interpolated instead")
+        return points
+    carried: Floats = moved + seconds * velocity
+    return carried
+
+
+def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
+    """The velocities or accelerations [count, 3] of the points of a sample."""
+    rates = value.floats(attribute, Usd.TimeCode(sample), 3)
+    if rates is None or len(rates) != count:
+        raise Unreadable(f"{attribute.GetName()} has {0 if rates is None else len(rates)} values for {count} points")
+    if not np.isfinite(rates).all():
+        raise Unreadable(f"{attribute.GetName()} has values that are NaN or infinite")
+    return rates
+
+
+def _bracket(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
+    """The times of the samples before and after a moment; None without samples.
+
+    Velocities go with points only if both have the same: that is how USD knows that they were made together.
+    """
+    samples = attribute.GetBracketingTimeSamples(time.GetValue()) if attribute else ()
+    return (samples[0], samples[1]) if samples else None
 
 
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:

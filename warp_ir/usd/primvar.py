@@ -49,8 +49,13 @@ def expand(shape: Shape, values: Floats, interpolation: str, indices: Ints | Non
 def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Floats | None:
     """The prim's own or inherited displayColor: float64 [3] if it is one colour, [m, 3, 3] if not, None if unset.
 
-    A primvar with a wrong number of values is reduced to its first value, and named.
+    A primvar with a wrong number of values is reduced to its first value, and named; so is a displayOpacity below 1.
     """
+    opacity = np.asarray(
+        value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
+    )
+    if opacity.dtype.kind == "f" and (opacity < 1.0).any():
+        report.warn(prim.GetPath(), "displayOpacity is not honoured: it is drawn opaque ({n} in all)")
     found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
     if not found or not found.HasValue():
         return None
