@@ -1,9 +1,12 @@
 """Geometry: triangulation, winding, normals, implicit shapes and instancing."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom, Vt
 
 from warp_ir import Mesh, Scene, load_usd
 
@@ -250,6 +253,51 @@ def test_the_surface_of_tetrahedra(tmp_path):
         assert volume(load(tmp_path, tet % more).meshes[0]) == pytest.approx(1 / 6)
 
 
+CACHE = """(
+    timeCodesPerSecond = 10
+)
+def Mesh "M" {
+    point3f[] points.timeSamples = { 0: %(first)s, 4: %(second)s }
+    vector3f[] velocities.timeSamples = { 0: %(velocities)s, 4: [(0, 0, 0), (0, 0, 0), (0, 0, 0)] }
+    %(more)s
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    uniform token subdivisionScheme = "none"
+}"""
+FIRST, SECOND = "[(0, 0, 0), (1, 0, 0), (0, 1, 0)]", "[(0, 0, 9), (1, 0, 9), (0, 1, 9)]"
+FASTER = "[(0, 0, 20), (0, 0, 20), (0, 0, 0)]"
+UPWARD = "[(0, 0, 5), (0, 0, 5), (0, 0, 5)]"
+
+
+@pytest.mark.parametrize("more", ["", f"vector3f[] accelerations.timeSamples = {{ 0: {FASTER}, 4: {FASTER} }}"])
+@pytest.mark.parametrize("time", [-1.0, 0.0, 1.0, 2.5, 4.0, 6.0])
+def test_velocities_carry_points_between_samples(tmp_path, more, time):
+    """Points are at p + v t + a t² / 2, t seconds after the sample before; USD's ComputePointsAtTime agrees."""
+    points = load(tmp_path, CACHE % dict(first=FIRST, second=SECOND, velocities=UPWARD, more=more), time=time)
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
+    expected = UsdGeom.PointBased(stage.GetPrimAtPath("/M")).ComputePointsAtTime(time, time)
+    assert points.meshes[0].points == pytest.approx(np.array(expected, dtype=float), abs=1e-6)
+    if 0.0 <= time < 4.0:
+        t = time / 10.0
+        assert points.meshes[0].points[0, 2] == pytest.approx(5.0 * t + (10.0 * t**2 if more else 0.0))
+
+
+@pytest.mark.parametrize(
+    ("velocities", "word"), [("[(0, 0, 5)]", "1 values for 3 points"), ("[(0,0,nan), (0,0,0), (0,0,0)]", "NaN")]
+)
+def test_velocities_that_do_not_fit_are_named(tmp_path, velocities, word):
+    """The points are interpolated as if there were none."""
+    scene = load(tmp_path, CACHE % dict(first=FIRST, second=SECOND, velocities=velocities, more=""), time=2.0)
+    assert warned(scene, "/M", "velocities", word) and scene.meshes[0].points[:, 2] == pytest.approx(4.5)
+
+
+def test_opacity_without_a_material_is_named(tmp_path):
+    """DisplayOpacity below 1 is drawn opaque, and says so; 1 is no trouble."""
+    for opacity, told in (("[0.5]", True), ("[1, 1]", False), ("[]", False)):
+        text = f"float[] primvars:displayOpacity = {opacity}"
+        assert warned(load(tmp_path, mesh_text(SQUARE, [4], range(4), text)), "/M", "displayOpacity") == told
+
+
 PI = np.pi
 # Areas and volumes of the schemas' defaults, in closed form.
 IMPLICIT = [
@@ -326,3 +374,33 @@ def test_impossible_dimensions_are_named_and_skipped(tmp_path, radius):
     """A radius that is negative, not a number or zero makes no sphere."""
     scene = load(tmp_path, f'def Sphere "S" {{ double radius = {radius}\n}}')
     assert scene.meshes == () and warned(scene, "/S", "skipped")
+
+
+@pytest.mark.slow
+def test_a_million_triangles_load_in_seconds(tmp_path):
+    """500 meshes with 1 024 000 triangles and normals, from a .usdc: below 5 s and 1 GB, as a process of its own."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "million.usdc"))
+    side = np.arange(33.0)
+    flat = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    corner = np.arange(32 * 33).reshape(32, 33)[:, :-1].reshape(-1)
+    quads = np.stack([corner, corner + 33, corner + 34, corner + 1], axis=1).astype(np.int32)
+    heights = np.random.default_rng(0).normal(scale=0.2, size=(500, len(flat), 1))
+    for k in range(500):
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/M{k}")
+        points = np.concatenate([flat, heights[k]], axis=1) + np.array([40 * (k % 25), 40 * (k // 25), 0])
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.tile(np.float32([0, 0.6, 0.8]), (len(flat), 1))))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(quads), 4, np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(quads.reshape(-1)))
+        mesh.CreateSubdivisionSchemeAttr("none")
+    stage.Save()
+    code = """
+import resource, sys, time
+import warp_ir as ir
+start = time.perf_counter()
+scene = ir.load_usd(sys.argv[1])
+print(scene.triangle_count, time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"""
+    command = [sys.executable, "-c", code, str(tmp_path / "million.usdc")]
+    count, seconds, kibibytes = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert count == "1024000"
+    assert float(seconds) < 5.0 and int(kibibytes) < 1_000_000

@@ -192,6 +192,18 @@ def test_only_the_default_level_of_detail_is_drawn(tmp_path):
     assert [mesh.name for mesh in scene.meshes] == ["/L/Fine"]
 
 
+def test_draw_modes_are_named_and_ignored(tmp_path):
+    """Cards, bounds and origins stand in for geometry in viewers; a renderer draws the geometry."""
+    text = """def Xform "%s" (prepend apiSchemas = ["GeomModelAPI"]) {
+    uniform token model:drawMode = "%s"
+    def Cube "C" {
+    }
+}
+"""
+    scene = load(tmp_path, text % ("A", "cards") + text % ("B", "default"))
+    assert len(scene.meshes) == 2 and warned(scene, "/A", "cards") and not warned(scene, "/B")
+
+
 def test_types_that_are_not_rendered_are_named_once_with_their_count(tmp_path):
     """Points and curves are warned about per type."""
     scene = load(tmp_path, 'def Points "A" {\n}\ndef Points "B" {\n}\ndef BasisCurves "C" {\n}')

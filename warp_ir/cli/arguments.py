@@ -205,6 +205,13 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         help="what to draw beside purpose 'default': render, proxy, guide (default: render)",
     )
     group.add_argument(
+        "--complexity",
+        "-c",
+        choices=("low", "medium", "high", "veryhigh"),
+        default="low",
+        help="of subdivision surfaces: their cages, or one, two, three levels of refinement (default: low)",
+    )
+    group.add_argument(
         "--default-light",
         choices=("none", "dome"),
         default="dome",

@@ -18,6 +18,7 @@ def load_scene(args: argparse.Namespace, time: float | None) -> Scene:
         camera=args.camera,
         time=time,
         purposes=tuple(dict.fromkeys(("default", *args.purposes))),
+        complexity=args.complexity,
         default_light=args.default_light,
         strict=args.strict,
     )

@@ -14,6 +14,7 @@ from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Shape, cross_products, place, without_slivers
+from warp_ir.usd.skel import Skinning, sharing_key
 from warp_ir.usd.walk import Site
 
 _MOST_TRIANGLES = 200_000_000
@@ -21,7 +22,7 @@ _MOST_TRIANGLES = 200_000_000
 
 
 def build_meshes(
-    sites: Sequence[Site], time: Usd.TimeCode, report: Report
+    sites: Sequence[Site], time: Usd.TimeCode, report: Report, levels: int = 0
 ) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
     """All meshes in the world, one per gprim with all its copies, and the materials they use.
 
@@ -29,20 +30,22 @@ def build_meshes(
         sites: The gprims and where they are drawn.
         time: Of the values.
         report: Where troubles go.
+        levels: How often subdivision surfaces are refined.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    return _Builder(time, report).run(sites)
+    return _Builder(time, report, levels).run(sites)
 
 
 class _Builder:
     """From gprims to meshes and the materials they use."""
 
-    def __init__(self, time: Usd.TimeCode, report: Report) -> None:
-        self._time, self._report = time, report
+    def __init__(self, time: Usd.TimeCode, report: Report, levels: int) -> None:
+        self._time, self._report, self._levels = time, report, levels
         self._table = MaterialTable(time, report)
-        self._shapes: dict[Sdf.Path, Shape | None] = {}
+        self._skinning = Skinning(time, report)
+        self._shapes: dict[tuple[Sdf.Path, ...], Shape | None] = {}
 
     def run(self, sites: Sequence[Site]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
         self._table.resolve([site.prim for site in sites])
@@ -61,7 +64,8 @@ class _Builder:
 
     def _shape(self, prim: Usd.Prim) -> Shape | None:
         """The prim's triangles in its own space; instances of the same prototype share them."""
-        key = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        key = (shared, *sharing_key(prim))
         if key not in self._shapes:
             try:
                 shape = self._read(prim)
@@ -78,8 +82,9 @@ class _Builder:
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if kind in IMPLICIT:
             return read_implicit(prim, kind, self._time)
-        read = read_tet_mesh if kind == "TetMesh" else read_mesh
-        return read(prim, self._time, self._report)
+        if kind == "TetMesh":
+            return read_tet_mesh(prim, self._time, self._report)
+        return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
     def _mesh(self, site: Site, shape: Shape) -> Mesh | None:
         """A gprim in all its places as one mesh."""

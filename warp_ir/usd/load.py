@@ -5,14 +5,15 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pxr import Usd
+import numpy as np
+from pxr import Tf, Usd
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.stage import open_stage, quiet, time_code, up_axis
+from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
 from warp_ir.usd.walk import Site, walk
 
 _COUNTED = (
@@ -32,6 +33,8 @@ _COUNTED = (
     "composition_errors",
 )
 """Counts that `Scene.stats` always has, in this order."""
+_LEVELS = {"low": 0, "medium": 1, "high": 2, "veryhigh": 3}
+"""How often `complexity` refines a subdivision surface, as usdrecord's complexities 1.0 to 1.3 do."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 
@@ -41,6 +44,7 @@ def load_usd(
     camera: str | None = None,
     time: float | None = None,
     purposes: Sequence[str] = ("default", "render"),
+    complexity: str = "low",
     default_light: str = "dome",
     strict: bool = False,
 ) -> Scene:
@@ -54,6 +58,8 @@ def load_usd(
             else the first, else one that frames the scene.
         time: Time code; None: the stage's start.
         purposes: Which of default, render, proxy and guide to draw.
+        complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
+            after one, two and three levels of refinement.
         default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
         strict: Whether the first warning is an error.
 
@@ -64,14 +70,20 @@ def load_usd(
     source = os.fspath(path)
     if isinstance(purposes, str) or not set(purposes) <= set(_PURPOSES):
         raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
+    if complexity not in _LEVELS:
+        raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
     if default_light not in ("dome", "none"):
         raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
     if time is not None and not math.isfinite(time):
         raise InputError(f"time: {time} is not a finite number")
     report = Report(source, strict=strict)
-    with quiet():
+    # Any number in a file may be NaN or huge; readers look at what they compute, NumPy need not say it first.
+    with quiet(), np.errstate(all="ignore"):
         stage = open_stage(source, report)
-        return _load(stage, time_code(stage, time), camera, purposes, default_light, report)
+        try:
+            return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
+        except Tf.ErrorException as error:  # damage that shows only when the value is unpacked
+            raise InputError(f"{source}: cannot be read: {first_message(error)}") from None
 
 
 def _load(
@@ -79,6 +91,7 @@ def _load(
     time: Usd.TimeCode,
     camera: str | None,
     purposes: Sequence[str],
+    levels: int,
     default_light: str,
     report: Report,
 ) -> Scene:
@@ -86,7 +99,7 @@ def _load(
     view = None if chosen is None else read_camera(chosen, time, report)
     axis = up_axis(stage, report)
     found = walk(stage, time, purposes, report)
-    meshes, materials = build_meshes(found.shapes, time, report)
+    meshes, materials = build_meshes(found.shapes, time, report, levels)
     lights = _lights(found.lights, time, report)
     if not meshes:
         hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""

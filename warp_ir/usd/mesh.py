@@ -3,28 +3,44 @@
 from dataclasses import replace
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import primvar, value
 from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.shape import Mask, Shape, cross_products, without_slivers
+from warp_ir.usd.shape import Mask, Shape, elements_of, shaded, without_slivers
+from warp_ir.usd.skel import Pose, Skinning
+from warp_ir.usd.subdivide import Scheme
+from warp_ir.usd.subdivision import read_subdivided
 from warp_ir.usd.triangulate import triangulate
 
 
-def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
+def read_mesh(
+    prim: Usd.Prim, time: Usd.TimeCode, report: Report, levels: int = 0, skinning: Skinning | None = None
+) -> Shape | None:
     """The triangles of a Mesh; None if it has no faces.
+
+    Args:
+        prim: The mesh.
+        time: Of the values.
+        report: Where troubles go.
+        levels: How often a subdivision surface is refined; 0 draws its cage.
+        skinning: Deforms meshes that are bound to a skeleton; None leaves them at rest.
 
     Raises:
         Unreadable: An array has the wrong type, or counts, indices and points do not belong together.
+        InputError: Subdivision would make more triangles than can be held.
     """
     mesh = UsdGeom.Mesh(prim)
-    points = value.floats(mesh.GetPointsAttr(), time, 3)
+    points = _points(mesh, time, report)
     counts = value.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = value.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
         return None
     _check_topology(points, counts, indices)
+    pose = None if skinning is None else skinning.pose(prim, points)
+    if pose is not None:
+        points = pose.points
     keep = np.ones(len(counts), dtype=bool)
     holes = value.ints(mesh.GetHoleIndicesAttr(), time)
     if holes is not None:
@@ -32,27 +48,26 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | Non
         if not inside.all():
             report.warn(prim.GetPath(), "{n} hole indices out of range ignored", int((~inside).sum()))
         keep[holes[inside]] = False
-    keep &= _finite_faces(prim, points, counts, indices, report)
+    finite = _finite_faces(prim, points, counts, indices, report)
+    keep &= finite
+    token = value.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark")
+    if token != UsdGeom.Tokens.none:
+        if levels and token in (scheme.value for scheme in Scheme):
+            return read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+        report.warn(
+            prim.GetPath(), "subdivision surface rendered as its cage; a higher complexity refines it ({n} in all)"
+        )
     corner, face = triangulate(points, counts, indices, keep)
     if value.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    if value.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark") != UsdGeom.Tokens.none:
-        report.warn(prim.GetPath(), "subdivision surface rendered as its cage ({n} in all)")
-    if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetJointIndicesPrimvar().HasValue():
-        report.warn(prim.GetPath(), "skinning is not read yet: the mesh is in its rest pose ({n} in all)")
     shape = Shape(
         points=points,
         triangles=indices.astype(np.int32)[corner],
         face=face,
         corner=corner,
-        elements={
-            "uniform": len(counts),
-            "vertex": len(points),
-            "varying": len(points),
-            "faceVarying": len(indices),
-        },
+        elements=elements_of(points, counts, indices),
     )
-    return _finished(prim, shape, int(keep.sum()), time, report)
+    return _finished(prim, shape, int(keep.sum()), time, report, pose)
 
 
 def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape | None:
@@ -62,29 +77,70 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points = value.floats(tets.GetPointsAttr(), time, 3)
+    points = _points(tets, time, report)
     faces = value.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
     if points is not None and (faces is None or len(faces) == 0):
         cells = value.ints(tets.GetTetVertexIndicesAttr(), time, 4)
         if cells is not None and len(cells):
-            _check_range(cells, len(points), "tetVertexIndices")
+            value.check_range(cells, len(points), "tetVertexIndices")
             faces = np.asarray(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, time), dtype=np.int64).reshape(-1, 3)
     if points is None or faces is None or len(faces) == 0:
         return None
-    _check_range(faces, len(points), "surfaceFaceVertexIndices")
+    value.check_range(faces, len(points), "surfaceFaceVertexIndices")
     counts = np.full(len(faces), 3)
     keep = _finite_faces(prim, points, counts, faces.reshape(-1), report)
     corner, face = triangulate(points, counts, faces.reshape(-1), keep)
     if value.text(tets.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    elements = {
-        "uniform": len(faces),
-        "vertex": len(points),
-        "varying": len(points),
-        "faceVarying": faces.size,
-    }
+    elements = elements_of(points, counts, faces.reshape(-1))
     shape = Shape(points, faces.reshape(-1).astype(np.int32)[corner], face, corner, elements=elements)
     return _finished(prim, shape, int(keep.sum()), time, report)
+
+
+def _points(shape: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> Floats | None:
+    """The points [n, 3]: where velocities carry them from the sample before, else interpolated by USD.
+
+    Velocities make sense of a cache whose topology changes from sample to sample, where nothing can be interpolated.
+    """
+    attribute, velocities = shape.GetPointsAttr(), shape.GetVelocitiesAttr()
+    points = value.floats(attribute, time, 3)
+    if points is None or time.IsDefault() or not velocities.HasAuthoredValue():
+        return points
+    bracket = _bracket(attribute, time)
+    if bracket is None or bracket[0] == time.GetValue():
+        return points
+    seconds: float = (time.GetValue() - bracket[0]) / shape.GetPrim().GetStage().GetTimeCodesPerSecond()
+    try:
+        moved = value.floats(attribute, Usd.TimeCode(bracket[0]), 3)
+        if moved is None or _bracket(velocities, time) != bracket:
+            return points
+        velocity = _rates(velocities, bracket[0], len(moved))
+        if _bracket(shape.GetAccelerationsAttr(), time) == bracket:
+            velocity = velocity + 0.5 * seconds * _rates(shape.GetAccelerationsAttr(), bracket[0], len(moved))
+    except Unreadable as trouble:
+        report.warn(shape.GetPath(), f"{trouble}; the points are interpolated instead")
+        return points
+    carried: Floats = moved + seconds * velocity
+    return carried
+
+
+def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
+    """The velocities or accelerations [count, 3] of the points of a sample."""
+    rates = value.floats(attribute, Usd.TimeCode(sample), 3)
+    if rates is None or len(rates) != count:
+        raise Unreadable(f"{attribute.GetName()} has {0 if rates is None else len(rates)} values for {count} points")
+    if not np.isfinite(rates).all():
+        raise Unreadable(f"{attribute.GetName()} has values that are NaN or infinite")
+    return rates
+
+
+def _bracket(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
+    """The times of the samples before and after a moment; None without samples.
+
+    Velocities go with points only if both have the same: that is how USD knows that they were made together.
+    """
+    samples = attribute.GetBracketingTimeSamples(time.GetValue()) if attribute else ()
+    return (samples[0], samples[1]) if samples else None
 
 
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
@@ -92,13 +148,7 @@ def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
         raise Unreadable("faceVertexCounts has negative values")
     if counts.sum() != len(indices):
         raise Unreadable(f"faceVertexCounts add up to {counts.sum()}, but faceVertexIndices has {len(indices)}")
-    _check_range(indices, len(points), "faceVertexIndices")
-
-
-def _check_range(indices: Ints, count: int, name: str) -> None:
-    if indices.size and (indices.min() < 0 or indices.max() >= count):
-        worst = indices.min() if indices.min() < 0 else indices.max()
-        raise Unreadable(f"{name} refers to point {worst} of {count}")
+    value.check_range(indices, len(points), "faceVertexIndices")
 
 
 def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, report: Report) -> Mask:
@@ -115,14 +165,16 @@ def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, r
     return keep
 
 
-def _finished(prim: Usd.Prim, shape: Shape, wanted: int, time: Usd.TimeCode, report: Report) -> Shape:
+def _finished(
+    prim: Usd.Prim, shape: Shape, wanted: int, time: Usd.TimeCode, report: Report, pose: Pose | None = None
+) -> Shape:
     """The shape without slivers and with its normals; of the `wanted` faces, those that vanished are counted."""
     shape = without_slivers(shape)
     lost = wanted - int(np.count_nonzero(np.bincount(shape.face))) if len(shape.face) else wanted
-    return _with_normals(prim, replace(shape, degenerate=lost), time, report)
+    return _with_normals(prim, replace(shape, degenerate=lost), time, report, pose)
 
 
-def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Shape:
+def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report, pose: Pose | None) -> Shape:
     """The shape with its authored normals; without any, or if they say no more than the winding, faceted."""
     authored = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     if authored and authored.HasValue():
@@ -139,11 +191,4 @@ def _with_normals(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Repo
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{trouble}; the mesh is faceted")
         return shape
-    geometric = cross_products(shape.points, shape.triangles)
-    geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    usable = np.isfinite(length) & (length > 1e-12)
-    normals = np.where(usable, normals / np.where(usable, length, 1.0), geometric[:, None])
-    if (np.einsum("mci,mi->mc", normals, geometric) > 1.0 - 1e-6).all():
-        return shape
-    return replace(shape, normals=normals.astype(np.float32))
+    return shaded(shape, normals if pose is None else pose.normals(normals, shape.triangles))

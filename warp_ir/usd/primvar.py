@@ -24,24 +24,38 @@ def expand(shape: Shape, values: Floats, interpolation: str, indices: Ints | Non
     if indices is not None:
         if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
             raise Unreadable(f"an index of the primvar is out of range, there are {len(values)} values")
-        values = values[indices]
+    count = len(values) if indices is None else len(indices)
     expected = 1 if interpolation == UsdGeom.Tokens.constant else shape.elements.get(interpolation)
     if expected is None:
         raise Unreadable(f"{interpolation} values on a shape that has no such elements")
-    if len(values) != expected:
-        raise Unreadable(f"{len(values)} {interpolation} values where {expected} are needed")
+    if count != expected:
+        raise Unreadable(f"{count} {interpolation} values where {expected} are needed")
+    if shape.refined is not None and interpolation == UsdGeom.Tokens.faceVarying:
+        return shape.refined.face_varying(values, indices)[shape.corner]
+    if indices is not None:
+        values = values[indices]
     if interpolation == UsdGeom.Tokens.constant:
         return np.broadcast_to(values[0], (*shape.triangles.shape, values.shape[1]))
     if interpolation == UsdGeom.Tokens.uniform:
         return np.broadcast_to(values[shape.face][:, None], (*shape.triangles.shape, values.shape[1]))
-    return values[shape.corner if interpolation == UsdGeom.Tokens.faceVarying else shape.triangles]
+    if interpolation == UsdGeom.Tokens.faceVarying:
+        return values[shape.corner]
+    if shape.refined is not None:
+        smooth = interpolation == UsdGeom.Tokens.vertex
+        values = shape.refined.vertex(values) if smooth else shape.refined.varying(values)
+    return values[shape.triangles]
 
 
 def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Floats | None:
     """The prim's own or inherited displayColor: float64 [3] if it is one colour, [m, 3, 3] if not, None if unset.
 
-    A primvar with a wrong number of values is reduced to its first value, and named.
+    A primvar with a wrong number of values is reduced to its first value, and named; so is a displayOpacity below 1.
     """
+    opacity = np.asarray(
+        value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
+    )
+    if opacity.dtype.kind == "f" and (opacity < 1.0).any():
+        report.warn(prim.GetPath(), "displayOpacity is not honoured: it is drawn opaque ({n} in all)")
     found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
     if not found or not found.HasValue():
         return None

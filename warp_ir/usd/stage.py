@@ -8,6 +8,7 @@ from pathlib import Path
 from pxr import Tf, Usd, UsdGeom, UsdUtils
 
 from warp_ir.scene import InputError
+from warp_ir.usd.crate import check_sizes
 from warp_ir.usd.report import Report
 
 _SHOWN = 5
@@ -35,10 +36,10 @@ def open_stage(path: str, report: Report) -> Usd.Stage:
     if Path(path).is_dir():
         raise InputError(f"{path}: is a directory, not a USD file")
     try:
+        check_sizes(path)
         stage = Usd.Stage.Open(path)
-    except (Tf.ErrorException, RuntimeError) as error:
-        reason = _reason(str(error)).removeprefix(f"{path}:")
-        raise InputError(f"{path}: cannot be opened as USD: {reason}") from None
+    except (Tf.ErrorException, RuntimeError, OSError) as error:
+        raise InputError(f"{path}: cannot be opened as USD: {first_message(error).removeprefix(f'{path}:')}") from None
     errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
     for text in list(errors)[:_SHOWN]:
         report.warn("/", f"composition: {text}")
@@ -67,10 +68,14 @@ def up_axis(stage: Usd.Stage, report: Report) -> str:
     return str(axis)
 
 
-def _reason(error: str) -> str:
-    """The first message of an exception of USD, without its source locations."""
-    messages = re.findall(r": '(.*?)'\s*(?=\n\s*Error in|$)", error, flags=re.DOTALL)
-    return _tidy(messages[0] if messages else error)
+def first_message(error: Exception) -> str:
+    """The first message of an exception of USD, in one line and without its source location."""
+    try:
+        text = str(error)
+    except UnicodeDecodeError:  # it quotes the file, which is no text
+        return "the file is damaged, or no USD file"
+    messages = re.findall(r": '(.*?)'\s*(?=\n\s*Error in|$)", text, flags=re.DOTALL)
+    return _tidy(messages[0] if messages else text)
 
 
 def _tidy(message: str) -> str:

@@ -37,6 +37,21 @@ def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats
     return array.astype(np.float64)
 
 
+def scalars(attribute: Usd.Attribute, time: Usd.TimeCode) -> Floats | None:
+    """An array of numbers, float64 [n]; None where nothing is authored.
+
+    Raises:
+        Unreadable: The value is of another type.
+    """
+    value = raw(attribute, time)
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.ndim != 1 or array.dtype.kind not in "fiu":
+        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of numbers")
+    return array.astype(np.float64)
+
+
 def ints(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int = 1) -> Ints | None:
     """An array of integers, int64 [n] or [n, columns]; None where nothing is authored.
 
@@ -52,6 +67,17 @@ def ints(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int = 1) -> Ints
     if array.shape[1:] != ((columns,) if columns > 1 else ()) or array.ndim == 0 or array.dtype.kind not in "iu":
         raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of integers")
     return array.astype(np.int64)
+
+
+def check_range(indices: Ints, count: int, name: str) -> None:
+    """See that indices, of points of which there are `count`, exist.
+
+    Raises:
+        Unreadable: They do not; `name` is what holds them.
+    """
+    if indices.size and (indices.min() < 0 or indices.max() >= count):
+        worst = indices.min() if indices.min() < 0 else indices.max()
+        raise Unreadable(f"{name} refers to point {worst} of {count}")
 
 
 def number(attribute: Usd.Attribute, time: Usd.TimeCode, default: float) -> float:

@@ -111,6 +111,10 @@ class _Walk:
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
         elif prim.HasAPI(UsdLux.LightAPI) or kind in ("PluginLight", "LightFilter", "PluginLightFilter"):
             report.warn(prim.GetPath(), f"{kind} is not read yet: it emits nothing")
+        if prim.HasAPI(UsdGeom.ModelAPI):
+            mode = value.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
+            if mode not in ("inherited", "default"):
+                report.warn(prim.GetPath(), f"draw mode '{mode}' is not honoured: the geometry itself is drawn")
         children = prim.GetFilteredChildren(_PROTOTYPE if visit.instancers else _DRAWN)
         if children and "LODRootAPI" in prim.GetAppliedSchemas():
             # Levels of detail exclude each other; who cannot choose shows the default one.

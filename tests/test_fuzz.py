@@ -1,0 +1,96 @@
+"""Mutated files load or are refused in one line: no traceback, no crash, no hang, no memory without bound."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pxr import Tf, UsdUtils
+
+import warp_ir as ir
+
+from . import fuzz
+
+ROOT = Path(__file__).resolve().parents[1]
+BATCH = 200
+SECONDS = 20.0
+"""For one file; they are small, and take some 30 ms."""
+MEBIBYTES = 1500
+"""For the process, which has USD and NumPy in it."""
+
+
+@pytest.fixture(scope="session")
+def sources(tmp_path_factory):
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    found = fuzz.seeds(tmp_path_factory.mktemp("sources"))
+    delegate.TakeUncoalescedDiagnostics()
+    return found
+
+
+def _outcomes(folder, sources, seeds):
+    """What became of the file of each seed, in a process that none of them may end."""
+    files = []
+    for seed in seeds:
+        try:
+            files.append(fuzz.mutate(sources, folder, seed).name)
+        except Tf.ErrorException:  # not even USD writes that
+            continue
+    orders = "".join(f"{name} {'medium' if k % 3 else 'low'}\n" for k, name in enumerate(files))
+    command = [sys.executable, "-W", "error", "-X", "faulthandler", "-m", "tests.fuzz", str(folder)]
+    try:
+        done = subprocess.run(
+            command, input=orders, capture_output=True, text=True, cwd=ROOT, timeout=SECONDS * 10, check=False
+        )
+        said, error = done.stdout.splitlines(), done.stderr
+    except subprocess.TimeoutExpired as late:
+        said, error = (late.stdout or b"").decode().splitlines(), "too late"
+    assert len(said) == len(files), f"{files[len(said)]}: the process ended there: {error[-2000:]}"
+    return [re.fullmatch(r"(\S+) (\S+) (\S+) (.*)", line).groups() for line in said]
+
+
+def test_the_unharmed_sources_load(tmp_path, sources):
+    """What is mutated is sound: every source is a scene with triangles, without skipped prims."""
+    for source in sources:
+        scene = ir.load_usd(source)
+        assert scene.triangle_count > 0 and not any("skipped" in line for line in scene.warnings), scene.warnings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(12))
+def test_mutated_files_load_or_are_refused(tmp_path, sources, batch):
+    """Bytes flipped, moved and cut; text rewritten; values of wrong types, lengths and indices; cycles."""
+    outcomes = _outcomes(tmp_path, sources, range(batch * BATCH, (batch + 1) * BATCH))
+    for name, seconds, memory, outcome in outcomes:
+        assert outcome.startswith(("scene", "refused")), f"{name}: {outcome}"
+        assert float(seconds) < SECONDS and int(memory) < MEBIBYTES, f"{name}: {seconds} s, {memory} MiB"
+    loaded = sum(outcome.startswith("scene") for *_, outcome in outcomes)
+    assert BATCH // 4 < loaded < BATCH  # mutations that never, or always, stop the loader test little
+
+
+def test_a_damaged_count_costs_no_memory(tmp_path, sources):
+    """A .usdc whose table of contents claims 2³² entries is refused at once, alone and inside of a .usdz."""
+    for suffix in (".usdc", ".usdz"):
+        source = next(path for path in sources if path.name == f"cornell_box{suffix}")
+        data = bytearray(source.read_bytes())
+        start = data.index(b"PXR-USDC")
+        directory = start + int.from_bytes(data[start + 16 : start + 24], "little")
+        data[directory : directory + 8] = (1 << 27).to_bytes(8, "little")
+        (tmp_path / f"bad{suffix}").write_bytes(data)
+        with pytest.raises(ir.InputError, match="table of contents is damaged"):
+            ir.load_usd(tmp_path / f"bad{suffix}")
+        data = bytearray(source.read_bytes())
+        tokens = data.index(b"TOKENS\0", directory)
+        table = start + int.from_bytes(data[tokens + 16 : tokens + 24], "little")
+        data[table : table + 8] = (1 << 40).to_bytes(8, "little")
+        (tmp_path / f"bad{suffix}").write_bytes(data)
+        with pytest.raises(ir.InputError, match="table TOKENS is damaged"):
+            ir.load_usd(tmp_path / f"bad{suffix}")
+
+
+def test_text_that_is_no_text_is_refused(tmp_path):
+    """An error message that quotes bytes which are no UTF-8 is still one line."""
+    (tmp_path / "bad.usda").write_bytes(b'#usda 1.0\ndef Mesh "\xfb\xe8" {\n')
+    with pytest.raises(ir.InputError, match="damaged") as caught:
+        ir.load_usd(tmp_path / "bad.usda")
+    assert "\n" not in str(caught.value)
