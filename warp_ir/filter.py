@@ -16,7 +16,10 @@ wp.set_module_options({"enable_backward": False})
 
 LEVELS = 5
 """Passes; their taps lie 1, 2, 4, ... pixels apart."""
-_SIGMA = wp.constant(3.0)  # standard errors by which two estimates of one value may well differ
+_SIGMA = 5.0
+"""Standard errors by which two estimates of one value may well differ, in the first pass ..."""
+_NARROW = 0.4
+"""... and its factor from pass to pass: what is left then is smooth, and differences farther apart are real."""
 _PLANE = wp.constant(4.0)  # footprints off the plane at which a point belongs to another surface
 
 
@@ -74,15 +77,15 @@ def _tap(k: int) -> float:
 
 
 @wp.func
-def _alike(a: wp.vec4, b: wp.vec4) -> float:
+def _alike(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
     """Whether `b` can be an estimate of the value of `a`, by the noise of `a`: so a spike is mended and not spread."""
     d = (a[0] + a[1] + a[2] - b[0] - b[1] - b[2]) * (1.0 / 3.0)
-    t = 1.0 + d * d / (2.0 * _SIGMA * _SIGMA * a[3] + 1.0e-30)
+    t = 1.0 + d * d / (2.0 * sigma * sigma * a[3] + 1.0e-30)
     return 1.0 / (t * t)
 
 
 @wp.kernel
-def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int) -> None:
+def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int, sigma: float) -> None:
     """One pass of 5 x 5 taps, `step` pixels apart."""
     p = first + wp.tid()
     here = source.direct[p]
@@ -113,8 +116,8 @@ def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, ste
                             a = w
                             b = w
                             if known:
-                                a *= _alike(here, d)
-                                b *= _alike(there, i)
+                                a *= _alike(here, d, sigma)
+                                b *= _alike(there, i, sigma)
                         direct += wp.vec4(d[0] * a, d[1] * a, d[2] * a, d[3] * a * a)
                         indirect += wp.vec4(i[0] * b, i[1] * b, i[2] * b, i[3] * b * b)
                         weights += wp.vec2(a, b)
@@ -142,6 +145,6 @@ def filter_layer(surfaces: Any, layer: Any, launcher: Launcher) -> Any:
     pixels = surfaces.columns * surfaces.rows
     other = new_layer(pixels, launcher)
     for level in range(LEVELS):
-        launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level])
+        launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level, _SIGMA * _NARROW**level])
         layer, other = other, layer
     return layer

@@ -34,12 +34,16 @@ _EDGE_JITTER = wp.constant(wp.uint32(0xBB67AE85))
 
 @wp.struct
 class Observations:
-    """Sums over the samples of irradiance over π that fell on each pixel's surface."""
+    """Sums over the samples of irradiance over π that fell on each pixel's surface, and of those on no pixel's."""
 
+    surfaces: Surfaces
     direct: wp.array[wp.vec3]
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the two mean channels
     count: wp.array[wp.int32]
+    other_direct: wp.array[wp.vec3]  # on surfaces that neither the pixel's centre shows nor a neighbour's
+    other_indirect: wp.array[wp.vec3]
+    other_count: wp.array[wp.int32]
 
 
 @wp.kernel
@@ -54,26 +58,43 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
         surfaces.footprint[p] = size * wp.where(camera.orthographic == 1, 1.0, gbuffer.depth[p])
 
 
+@wp.func
+def _shown_nearby(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> bool:
+    """Whether a pixel or one of its eight neighbours shows the surface of a point."""
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            x = p % surfaces.columns + dx
+            y = p // surfaces.columns + dy
+            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
+                if same_surface(surfaces, y * surfaces.columns + x, position, normal) > _MATCH:
+                    return True
+    return False
+
+
 @wp.kernel
 def _observe(
     first: int,
-    surfaces: Surfaces,
     gbuffer: GBuffer,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
     seen: Observations,
 ) -> None:
-    """Adds one iteration's sample of a pixel, if it fell on the pixel's surface."""
+    """Adds one iteration's sample of a pixel to those on its surface, or on none."""
     p = first + wp.tid()
+    surfaces = seen.surfaces
     if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
-        if same_surface(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]) > _MATCH:
-            d = mean_channel(direct[p])
-            i = mean_channel(indirect[p])
-            if wp.isfinite(d) and wp.isfinite(i):
+        d = mean_channel(direct[p])
+        i = mean_channel(indirect[p])
+        if wp.isfinite(d) and wp.isfinite(i):
+            if same_surface(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]) > _MATCH:
                 seen.direct[p] += direct[p]
                 seen.indirect[p] += indirect[p]
                 seen.squares[p] += wp.vec2(d * d, i * i)
                 seen.count[p] += 1
+            elif not _shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]):
+                seen.other_direct[p] += direct[p]
+                seen.other_indirect[p] += indirect[p]
+                seen.other_count[p] += 1
 
 
 @wp.kernel
@@ -213,12 +234,66 @@ def _on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
     return False
 
 
+@wp.struct
+class _Pixel:
+    """What camera rays through a pixel found: emitted and reflected radiance, without exposure."""
+
+    emission: wp.vec3
+    direct: wp.vec3
+    indirect: wp.vec3
+    rays: int
+
+
+@wp.func
+def _look_closely(
+    scene: SceneData, camera: CameraData, seen: Observations, layer: Layer, p: int, own: _Lit, most: int
+) -> _Pixel:
+    """Sends rays through a pixel on an edge; `own` is the irradiance of what no pixel shows."""
+    surfaces = seen.surfaces
+    row = p // camera.columns
+    column = p - row * camera.columns
+    scramble = sampling.hash_combine(wp.uint32(p), _EDGE_JITTER)
+    first_albedo = wp.vec3(0.0)
+    first_emission = wp.vec3(0.0)
+    mixed = bool(False)
+    out = _Pixel()
+    while out.rays < most and (mixed or out.rays < _PROBES):
+        u = sampling.sample_2d(scene.sobol, out.rays, 0, scramble)
+        x = (float(column) + u[0]) / float(camera.columns)
+        y = (float(row) + u[1]) / float(camera.rows)
+        point = see(scene, camera, camera_ray(camera, x, y))
+        if out.rays == 0:
+            first_albedo = point.albedo
+            first_emission = point.emission
+        # Of one surface, the pixel needs no more rays: the edge lies in its neighbour.
+        contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_emission)
+        mixed = mixed or contrast > 0.0 or point.mesh < 0
+        mixed = mixed or same_surface(surfaces, p, point.position, point.shading_normal) < _MATCH
+        out.rays += 1
+        out.emission += point.emission
+        if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
+            lit = _interpolate(surfaces, layer, row, column, u, point)
+            if lit.weight == 0.0:
+                lit = own
+            out.direct += wp.cw_mul(point.albedo, lit.direct) / lit.weight
+            out.indirect += wp.cw_mul(point.albedo, lit.indirect) / lit.weight
+    out.emission = out.emission / float(out.rays)
+    out.direct = out.direct / float(out.rays)
+    out.indirect = out.indirect / float(out.rays)
+    return out
+
+
+@wp.func
+def _single(v: wp.vec3d) -> wp.vec3:
+    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
 @wp.kernel
 def _compose(
     first: int,
     scene: SceneData,
     camera: CameraData,
-    surfaces: Surfaces,
+    seen: Observations,
     layer: Layer,
     film: FilmData,
     weight: wp.vec3,
@@ -226,60 +301,35 @@ def _compose(
 ) -> None:
     """Radiance of a pixel from irradiance on surfaces; `weight` is (1 / iterations, exposure, edge rays)."""
     p = first + wp.tid()
+    surfaces = seen.surfaces
     share = weight[0]
-    emitted = wp.vec3(float(film.emission[p][0]), float(film.emission[p][1]), float(film.emission[p][2])) * share
-    raw_direct = wp.vec3(float(film.direct[p][0]), float(film.direct[p][1]), float(film.direct[p][2])) * share
-    raw_indirect = wp.vec3(float(film.indirect[p][0]), float(film.indirect[p][1]), float(film.indirect[p][2])) * share
+    exposure = weight[1]
+    emitted = _single(film.emission[p]) * share
+    raw_direct = _single(film.direct[p]) * share
+    raw_indirect = _single(film.indirect[p]) * share
     albedo = film.albedo[p] * share
-    direct = wp.vec3(0.0)
-    indirect = wp.vec3(0.0)
-    if not _on_edge(surfaces, film, p):
-        if surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
-            direct = wp.cw_mul(albedo, _color(layer.direct[p])) * weight[1]
-            indirect = wp.cw_mul(albedo, _color(layer.indirect[p])) * weight[1]
-        else:
-            direct = raw_direct
-            indirect = raw_indirect
-    else:
-        # The mean irradiance of the pixel itself, for what none of the neighbours shows.
-        own_direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
-        own_indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
-        rays = int(0)
-        mixed = bool(False)
-        scramble = sampling.hash_combine(wp.uint32(p), _EDGE_JITTER)
-        row = p // camera.columns
-        column = p - row * camera.columns
-        glow = wp.vec3(0.0)
-        first_albedo = wp.vec3(0.0)
-        first_glow = wp.vec3(0.0)
-        while rays < int(weight[2]) and (mixed or rays < _PROBES):
-            u = sampling.sample_2d(scene.sobol, rays, 0, scramble)
-            x = (float(column) + u[0]) / float(camera.columns)
-            y = (float(row) + u[1]) / float(camera.rows)
-            point = see(scene, camera, camera_ray(camera, x, y))
-            if rays == 0:
-                first_albedo = point.albedo
-                first_glow = point.emission
-            glow += point.emission
-            # Of one surface, the pixel needs no more rays: the edge lies in its neighbour.
-            mixed = mixed or wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_glow) > 0.0
-            mixed = mixed or point.mesh < 0 or surfaces.footprint[p] <= 0.0
-            mixed = mixed or same_surface(surfaces, p, point.position, point.shading_normal) < _MATCH
-            rays += 1
-            if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
-                lit = _interpolate(surfaces, layer, row, column, u, point)
-                if lit.weight > 0.0:
-                    direct += wp.cw_mul(point.albedo, lit.direct) * (weight[1] / lit.weight)
-                    indirect += wp.cw_mul(point.albedo, lit.indirect) * (weight[1] / lit.weight)
-                else:
-                    direct += wp.cw_mul(point.albedo, own_direct)
-                    indirect += wp.cw_mul(point.albedo, own_indirect)
-        direct /= float(rays)
-        indirect /= float(rays)
-        glow *= weight[1] / float(rays)
+    direct = raw_direct
+    indirect = raw_indirect
+    if _on_edge(surfaces, film, p):
+        # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
+        own = _Lit()
+        own.weight = float(seen.other_count[p])
+        own.direct = seen.other_direct[p]
+        own.indirect = seen.other_indirect[p]
+        if seen.other_count[p] == 0:
+            own.weight = exposure
+            own.direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
+            own.indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
+        pixel = _look_closely(scene, camera, seen, layer, p, own, int(weight[2]))
+        direct = pixel.direct * exposure
+        indirect = pixel.indirect * exposure
         # The iterations have sampled the emission of this pixel too.
         n = 1.0 / share
-        emitted = (emitted * n + glow * float(rays)) / (n + float(rays))
+        rays = float(pixel.rays)
+        emitted = (emitted * n + pixel.emission * (exposure * rays)) / (n + rays)
+    elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
+        direct = wp.cw_mul(albedo, _color(layer.direct[p])) * exposure
+        indirect = wp.cw_mul(albedo, _color(layer.indirect[p])) * exposure
     if surfaces.footprint[p] > 0.0:
         # Nothing is believed that the plain mean contradicts.
         difference = mean_channel(direct + indirect - raw_direct - raw_indirect)
@@ -306,19 +356,21 @@ class Reconstruction:
             surfaces.footprint = launcher.empty(pixels, wp.float32)
             trace_primary(scene, camera, launcher, gbuffer, iteration=-1, seed=0)
             launcher.launch(_look, pixels, [camera, gbuffer, surfaces])
-            self._surfaces = surfaces
-            self._seen = Observations()
-            self._seen.direct, self._seen.indirect = launcher.zeros(pixels, wp.vec3), launcher.zeros(pixels, wp.vec3)
-            self._seen.squares = launcher.zeros(pixels, wp.vec2)
-            self._seen.count = launcher.zeros(pixels, wp.int32)
+            seen = Observations()
+            seen.surfaces = surfaces
+            for name in ("direct", "indirect", "other_direct", "other_indirect"):
+                setattr(seen, name, launcher.zeros(pixels, wp.vec3))
+            seen.squares = launcher.zeros(pixels, wp.vec2)
+            seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
+            self._surfaces, self._seen = surfaces, seen
 
     def observe(self, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Adds one iteration's samples of irradiance over π."""
-        self._launcher.launch(_observe, self._pixels, [self._surfaces, gbuffer, direct, indirect, self._seen])
+        self._launcher.launch(_observe, self._pixels, [gbuffer, direct, indirect, self._seen])
 
     def merge(self, other: "Reconstruction") -> None:
         """Adds another's samples."""
-        for name in Observations.vars:
+        for name in Observations.vars.keys() - {"surfaces"}:
             mine, theirs = getattr(self._seen, name), getattr(other._seen, name)
             mine.assign(mine.numpy() + theirs.numpy())
 
@@ -332,7 +384,5 @@ class Reconstruction:
             out = launcher.empty((2, pixels), wp.vec3)
             rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
-            launcher.launch(
-                _compose, pixels, [self._scene.data, self._camera, self._surfaces, layer, film, weight, out]
-            )
+            launcher.launch(_compose, pixels, [self._scene.data, self._camera, self._seen, layer, film, weight, out])
             return np.asarray(out.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
