@@ -314,7 +314,9 @@ def Material "L" {
 def test_only_the_wanted_is_refined(tmp_path):
     """Polygonal meshes stay as they are; Loop with polygons refines its triangles; bilinear adds no curvature."""
     text = mesh_text(SQUARE, [4], range(4), name="P") + scheme_text(SQUARE, [[0, 1, 2, 3]], scheme="loop", name="L")
-    plain, loop = load(tmp_path, text, complexity="high").meshes
+    scene = load(tmp_path, text, complexity="high")
+    plain, loop = scene.meshes
+    assert warned(scene, "/L", "Loop", "cut")
     assert len(plain.triangles) == 2 and len(loop.triangles) == 2 * 16
     triangle = load(tmp_path, scheme_text(SQUARE[:3], [[0, 1, 2]], scheme="loop"), complexity="high").meshes[0]
     assert area(triangle) == pytest.approx(0.5) and len(triangle.triangles) == 16

@@ -12,7 +12,7 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.lights import lights_along
-from warp_ir.surface import albedo, closest, emission, shading_normal
+from warp_ir.surface import albedo, closest, emission, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,8 +24,8 @@ class GBuffer:
     """One row per pixel, the top left first; in the scene's device frame."""
 
     mesh: wp.array[wp.int32]  # index into Scene.meshes; -1: background
-    position: wp.array[wp.vec3]  # off the surface, where shadow rays start
-    normal: wp.array[wp.vec3]  # geometric, towards the camera
+    position: wp.array[wp.vec3]  # off the (smooth) surface, where shadow rays start
+    normal: wp.array[wp.vec3]  # geometric, or that of the smooth surface; light comes from its side alone
     shading_normal: wp.array[wp.vec3]
     albedo: wp.array[wp.vec3]
     emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection
@@ -82,6 +82,10 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.position = hit.position
         sight.normal = hit.normal
         sight.shading_normal = shading_normal(scene, hit)
+        rise = smooth_rise(scene, hit)
+        if wp.length_sq(rise) > 0.0:
+            sight.position += rise
+            sight.normal = sight.shading_normal
         sight.albedo = albedo(scene, hit)
         sight.emission = emission(scene, hit)
         sight.depth = hit.t + camera.near

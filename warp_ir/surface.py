@@ -96,6 +96,30 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
 
 
 @wp.func
+def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
+    """From a hit to the smooth surface that its triangle's normals stand for; zero where that is not above it.
+
+    The point is projected onto the planes of the corners and their normals, and the results are interpolated (Hanika
+    2021, Hacking the Shadow Terminator). Light that falls on the smooth surface at grazing angles passes behind the
+    triangle's plane: from the triangle itself it could not be seen.
+    """
+    rise = wp.vec3(0.0)
+    row = scene.triangle_normals[hit.triangle]
+    if row < 0:
+        return rise
+    for k in range(3):
+        weight = wp.where(k == 0, hit.u, wp.where(k == 1, hit.v, 1.0 - hit.u - hit.v))
+        n = scene.corner_normals[row + k]
+        n = wp.where(wp.dot(n, hit.normal) < 0.0, -n, n)
+        below = wp.dot(scene.points[scene.indices[3 * hit.triangle + k]] - hit.position, n)
+        rise += weight * wp.max(below, 0.0) * n
+    # What stands on the surface, or close above it, must stay above the point.
+    if wp.length_sq(rise) > 0.0 and intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
+        return wp.vec3(0.0)
+    return rise
+
+
+@wp.func
 def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
     """Hemispherical reflectance ρ at a hit."""
     row = scene.triangle_colors[hit.triangle]

@@ -96,6 +96,8 @@ def _cage(
     """The mesh as its subdivision sees it: the faces present (holes too), its creases, corners and boundaries."""
     present = present & (counts >= 3)
     if scheme is Scheme.LOOP:
+        if (counts[present] != 3).any():
+            report.warn(mesh.GetPath(), "Loop subdivision takes triangles: its other faces are cut into some first")
         triangles, face = triangulate(points, counts, indices, present)
         corner, size = triangles.reshape(-1).astype(np.int64), np.full(len(face), 3)
     else:
