@@ -390,7 +390,8 @@ def _every_flag():
         if name not in ("visible_lights",) and not isinstance(value, bool):
             given = {None: "1"}.get(value, str(value))
             given = "roulette" if name == "absorption" else given
-            words += [f"--{name.replace('_', '-')}", given]
+            many = [str(x) for x in value] if isinstance(value, tuple) else [given]
+            words += [f"--{name.replace('_', '-')}", *many]
         elif isinstance(value, bool):
             words.append(f"--{name.replace('_', '-')}")
     return words

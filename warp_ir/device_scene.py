@@ -17,6 +17,7 @@ from warp_ir import sampling
 from warp_ir.bvh import Bvh, build_bvh
 from warp_ir.launch import Launcher
 from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Projection, Scene
+from warp_ir.settings import RenderSettings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,8 +71,12 @@ class SceneData:
 class CameraData:
     """A camera in the scene's device frame, and the image it fills."""
 
-    columns: int
+    columns: int  # of the film: the whole image, or the data window in it
     rows: int
+    first_column: int  # of the film in the image
+    first_row: int
+    image_columns: int
+    image_rows: int
     shows_lights: int  # 1: analytic lights are visible
     origin: wp.vec3
     right: wp.vec3
@@ -84,6 +89,9 @@ class CameraData:
     near: float
     far: float
     orthographic: int
+    lens_radius: float  # 0: a pinhole
+    focus: float  # depth of the plane that is sharp
+    blurs: int  # 1: the rays of a pixel differ in more than where they cross it
 
 
 @dataclass(frozen=True)
@@ -159,28 +167,38 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
         )
 
 
-def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int, *, visible_lights: bool) -> Any:
-    """The `CameraData` of a camera fitted to an image of `width` x `height` pixels.
+def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> Any:
+    """The `CameraData` of a camera fitted to the image that the settings describe; their height must be set.
 
     Raises:
         InputError: The window is empty, or something is not finite.
     """
-    camera = camera.fit(width, height)
-    left, right, bottom, top = camera.window
+    assert settings.height is not None
     if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.window).all()):
         raise InputError(f"camera {camera.name!r}: transform and window must be finite")
+    left, right, bottom, top = camera.window
     if not (right > left and top > bottom):
         raise InputError(f"camera {camera.name!r}: the window is empty")
-    unit = 1.0 if camera.projection == Projection.PERSPECTIVE else frame.scale
+    perspective = camera.projection == Projection.PERSPECTIVE
+    lens = camera.lens_radius if perspective and settings.depth_of_field else 0.0
+    if not (0.0 <= lens < np.inf and (lens == 0.0 or 0.0 < camera.focus_distance < np.inf)):
+        raise InputError(f"camera {camera.name!r}: lens_radius and focus_distance must be finite and not negative")
+    fitted = camera.fit(settings.width, settings.height, settings.conform, settings.pixel_aspect)
+    left, right, bottom, top = fitted.window
+    unit = 1.0 if perspective else frame.scale
     out = CameraData()
-    out.columns, out.rows, out.shows_lights = width, height, int(visible_lights)
+    out.first_column, out.first_row, out.columns, out.rows = settings.pixels()
+    out.image_columns, out.image_rows = settings.width, settings.height
+    out.shows_lights = int(settings.visible_lights)
     out.origin = wp.vec3(*frame.to_device(camera.world_from_camera[:3, 3]))
     out.right, out.up, out.back = (wp.vec3(*camera.world_from_camera[:3, k]) for k in range(3))
     out.left, out.bottom = left * unit, bottom * unit
     out.width, out.height = (right - left) * unit, (top - bottom) * unit
     out.near = camera.clipping[0] * frame.scale
     out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
-    out.orthographic = int(camera.projection == Projection.ORTHOGRAPHIC)
+    out.orthographic = int(not perspective)
+    out.lens_radius, out.focus = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
+    out.blurs = int(lens > 0.0)
     return out
 
 

@@ -4,6 +4,9 @@ A pixel stands for the surface seen through its centre. Samples of irradiance th
 filtered (`filter`): no pixel mixes surfaces, so edges do not stop the filter. What a pixel on an edge shows is then
 found by many cheap camera rays, each taking the irradiance of the neighbouring pixel whose surface it meets.
 
+Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Then only the pixels that have
+met nothing but the surface in their centre are filtered; the others keep their plain mean.
+
 Where the result differs from the plain mean by more than the noise explains, the mean is believed: the bias vanishes
 with the noise.
 """
@@ -50,7 +53,7 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
     if gbuffer.mesh[p] >= 0:
         surfaces.position[p] = gbuffer.position[p]
         surfaces.normal[p] = gbuffer.shading_normal[p]
-        size = camera.height / float(camera.rows)
+        size = camera.height / float(camera.image_rows)
         surfaces.footprint[p] = size * wp.where(camera.orthographic == 1, 1.0, gbuffer.depth[p])
 
 
@@ -115,6 +118,16 @@ def _spread(seen: Observations, q: int) -> wp.vec2:
     d = mean_channel(seen.direct[q])
     i = mean_channel(seen.indirect[q])
     return wp.max(seen.squares[q] - wp.vec2(d * d, i * i) / float(seen.count[q]), wp.vec2(0.0))
+
+
+@wp.kernel
+def _leave_out(first: int, seen: Observations, iterations: int, surfaces: Surfaces, layer: Layer) -> None:
+    """Makes a background of the pixels in which an iteration has seen more than the surface in their centre."""
+    p = first + wp.tid()
+    if seen.count[p] != iterations:
+        surfaces.footprint[p] = 0.0
+        layer.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+        layer.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
 
 
 @wp.struct
@@ -233,7 +246,7 @@ def _compose(
     albedo = film.albedo[p] * share
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    if not _on_edge(surfaces, film, p):
+    if camera.blurs == 1 or not _on_edge(surfaces, film, p):
         if surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
             direct = wp.cw_mul(albedo, _color(layer.direct[p])) * weight[1]
             indirect = wp.cw_mul(albedo, _color(layer.indirect[p])) * weight[1]
@@ -254,9 +267,7 @@ def _compose(
         first_glow = wp.vec3(0.0)
         while rays < int(weight[2]) and (mixed or rays < _PROBES):
             u = sampling.sample_2d(scene.sobol, rays, 0, scramble)
-            x = (float(column) + u[0]) / float(camera.columns)
-            y = (float(row) + u[1]) / float(camera.rows)
-            point = see(scene, camera, camera_ray(camera, x, y))
+            point = see(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
             if rays == 0:
                 first_albedo = point.albedo
                 first_glow = point.emission
@@ -326,13 +337,23 @@ class Reconstruction:
         """Radiance by way of lights and of surfaces, float32 [2, rows, columns, 3], from a `FilmData`."""
         launcher, pixels = self._launcher, self._pixels
         with launcher.phase("filter"):
-            layer = new_layer(pixels, launcher)
-            launcher.launch(_average, pixels, [self._surfaces, self._seen, layer])
-            layer = filter_layer(self._surfaces, layer, launcher)
+            surfaces, layer = self._surfaces, new_layer(pixels, launcher)
+            launcher.launch(_average, pixels, [surfaces, self._seen, layer])
+            if self._camera.blurs:
+                surfaces = _copy(surfaces)
+                launcher.launch(_leave_out, pixels, [self._seen, iterations, surfaces, layer])
+            layer = filter_layer(surfaces, layer, launcher)
             out = launcher.empty((2, pixels), wp.vec3)
             rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
-            launcher.launch(
-                _compose, pixels, [self._scene.data, self._camera, self._surfaces, layer, film, weight, out]
-            )
+            launcher.launch(_compose, pixels, [self._scene.data, self._camera, surfaces, layer, film, weight, out])
             return np.asarray(out.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
+
+
+def _copy(surfaces: Any) -> Any:
+    """The `Surfaces` with a footprint of their own."""
+    copy = Surfaces()
+    for name in Surfaces.vars:
+        setattr(copy, name, getattr(surfaces, name))
+    copy.footprint = wp.clone(surfaces.footprint)
+    return copy

@@ -79,33 +79,31 @@ class Renderer:
         Raises:
             InputError: The scene, the settings or the device cannot be used.
         """
-        height = settings.height or max(1, round(settings.width / scene.camera.aspect))
+        height = settings.height or max(1, round(settings.width * settings.pixel_aspect / scene.camera.aspect))
         self.settings = replace(settings, height=height)  # checks the number of pixels again
         if settings.denoise:
             require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
-        needed, there = settings.width * height * _BYTES_PER_PIXEL, self.launcher.memory()
+        _, _, columns, rows = self.settings.pixels()
+        needed, there = columns * rows * _BYTES_PER_PIXEL, self.launcher.memory()
         if needed > there:
             raise InputError(
-                f"width: {settings.width} x {height} pixels need about {needed / 2**30:.0f} GiB,"
+                f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
                 f" {self.launcher.device} has {there / 2**30:.0f}"
             )
         self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
         self.scene = upload_scene(scene, self.launcher)
         self._exposure = scene.camera.exposure
-        self._camera = camera_data(
-            scene.camera, self.scene.frame, settings.width, height, visible_lights=settings.visible_lights
-        )
+        self._camera = camera_data(scene.camera, self.scene.frame, self.settings)
         self._estimator = ESTIMATORS[settings.estimator](self.scene, self._camera, self.settings, self.launcher)
-        pixels = settings.width * height
+        pixels = columns * rows
         self._gbuffer = new_gbuffer(self.launcher, pixels)
         self._direct = self.launcher.empty(pixels, wp.vec3)
         self._indirect = self.launcher.empty(pixels, wp.vec3)
 
     def new_film(self) -> Film:
         """An empty film of the right size."""
-        assert self.settings.height is not None
-        film = Film(self.settings.width, self.settings.height, self.launcher, self.scene.frame)
+        film = Film(self._camera.columns, self._camera.rows, self.launcher, self.scene.frame)
         film.settings = self.settings
         if self.settings.filter and self.settings.estimator == "vpl" and not self.settings.denoise:
             film.reconstruction = Reconstruction(self.scene, self._camera, self.launcher, self._gbuffer, self._exposure)

@@ -17,6 +17,15 @@ Color = tuple[float, float, float]
 Floats = npt.NDArray[np.floating]
 Ints = npt.NDArray[np.integer]
 
+CONFORM_POLICIES = (
+    "expandAperture",
+    "cropAperture",
+    "adjustApertureWidth",
+    "adjustApertureHeight",
+    "adjustPixelAspectRatio",
+)
+"""How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
+
 
 class InputError(ValueError):
     """The user's input cannot be rendered; the message is one line that says what and where."""
@@ -100,7 +109,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole or orthographic camera that looks along its -Z, with +Y up."""
+    """A perspective or orthographic camera that looks along its -Z, with +Y up."""
 
     name: str = ""
     world_from_camera: Floats = field(default_factory=lambda: np.eye(4))
@@ -112,6 +121,10 @@ class Camera:
     """Nearest and farthest depth along -Z that camera rays see, in scene units."""
     exposure: float = 1.0
     """Linear factor on the film's radiance (UsdGeomCamera's exposure controls; 1 by default)."""
+    lens_radius: float = 0.0
+    """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
+    focus_distance: float = 1.0
+    """Depth along -Z at which a camera with a lens is sharp, in scene units."""
 
     @property
     def aspect(self) -> float:
@@ -119,12 +132,28 @@ class Camera:
         left, right, bottom, top = self.window
         return (right - left) / (top - bottom)
 
-    def fit(self, width: int, height: int) -> "Camera":
-        """This camera with its window grown to the aspect of an image (USD's `expandAperture`)."""
+    def fit(self, width: int, height: int, policy: str = CONFORM_POLICIES[0], pixel_aspect: float = 1.0) -> "Camera":
+        """This camera with its window made to fit an image, about its middle.
+
+        Args:
+            width: Of the image, in pixels.
+            height: Of the image.
+            policy: One of `CONFORM_POLICIES`: the window grows (expandAperture), shrinks (cropAperture), changes in
+                one of its sides alone (adjustApertureWidth, adjustApertureHeight), or stays as it is and the pixels
+                are stretched over it (adjustPixelAspectRatio).
+            pixel_aspect: Width of a pixel over its height.
+        """
         left, right, bottom, top = self.window
-        grow = (width / height) / self.aspect
-        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * max(grow, 1.0)
-        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * max(1.0 / grow, 1.0)
+        grow = width / height * pixel_aspect / self.aspect  # 1: it fits already
+        wider, taller = {
+            "expandAperture": (max(grow, 1.0), max(1.0 / grow, 1.0)),
+            "cropAperture": (min(grow, 1.0), min(1.0 / grow, 1.0)),
+            "adjustApertureWidth": (grow, 1.0),
+            "adjustApertureHeight": (1.0, 1.0 / grow),
+            "adjustPixelAspectRatio": (1.0, 1.0),
+        }[policy]
+        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * wider
+        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * taller
         return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
 
     @staticmethod

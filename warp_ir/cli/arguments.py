@@ -18,9 +18,14 @@ from warp_ir.settings import RenderSettings
 from warp_ir.tonemap import TONEMAPS
 
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
-_ONLY_PICTURES = {"iterations", "time_limit", "target_error", "visible_lights", "bound_radius"}
+_ONLY_PICTURES = {
+    *("iterations", "time_limit", "target_error", "visible_lights", "bound_radius"),
+    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur"),
+}
 """Settings that the light paths alone do not depend on."""
 _SHORT = {"width": ("-w",)}
+_LONG_CHOICE = 40
+"""Characters beyond which the choices of a setting do not stand in for its value, but in the text beside it."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
@@ -111,7 +116,8 @@ def settings_of(args: argparse.Namespace) -> RenderSettings:
     Raises:
         InputError: A value is out of range; the message names the flag.
     """
-    given = {name: value for name, value in vars(args).items() if name in _FIELDS}
+    given: dict[str, Any] = {name: value for name, value in vars(args).items() if name in _FIELDS}
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     try:
         return RenderSettings(**given)
     except InputError as error:
@@ -182,9 +188,16 @@ def _add_settings(group: Any, names: Collection[str]) -> None:
             options["action"] = argparse.BooleanOptionalAction if field.default else "store_true"
         elif field.metadata.get("choices"):
             options["choices"] = field.metadata["choices"]
+            if len(",".join(options["choices"])) > _LONG_CHOICE:
+                doc += f": {', '.join(options['choices'])}"
+                options["metavar"] = "NAME"
+        elif isinstance(field.default, tuple):
+            options |= {"type": float, "nargs": len(field.default), "metavar": "X"}
         else:
             options |= {"type": kind, "metavar": {int: "N", float: "X"}.get(kind, "TEXT")}
-        if field.default is not None and kind is not bool:
+        if isinstance(field.default, tuple):
+            doc += f" (default: {' '.join(f'{x:g}' for x in field.default)})"
+        elif field.default is not None and kind is not bool:
             doc += f" (default: {field.default:g})" if kind is float else f" (default: {field.default})"
         group.add_argument(_flag(name), *_SHORT.get(name, ()), help=doc, **options)
 

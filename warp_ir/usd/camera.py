@@ -78,8 +78,14 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
     half_y = 0.5 * positive(camera.GetVerticalApertureAttr(), 15.2908)
     x = optional(camera.GetHorizontalApertureOffsetAttr(), 0.0)
     y = optional(camera.GetVerticalApertureOffsetAttr(), 0.0)
-    if optional(camera.GetFStopAttr(), 0.0) > 0.0:
-        report.warn(prim.GetPath(), "depth of field is not rendered")
+    lens, focus = 0.0, optional(camera.GetFocusDistanceAttr(), 0.0)
+    stop = optional(camera.GetFStopAttr(), 0.0)
+    if stop > 0.0 and projection == Projection.ORTHOGRAPHIC:
+        report.warn(prim.GetPath(), "fStop: an orthographic camera has no depth of field")
+    elif stop > 0.0 and focus <= 0.0:
+        report.warn(prim.GetPath(), f"focusDistance is {focus:g}: no depth of field")
+    elif stop > 0.0:
+        lens = 0.5 * _TENTH / (unit * stop)
     if optional(camera.GetShutterCloseAttr(), 0.0) > optional(camera.GetShutterOpenAttr(), 0.0):
         report.warn(prim.GetPath(), "motion blur is not rendered")
     exposure = _exposure(camera, time)
@@ -93,6 +99,8 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
         projection=projection,
         clipping=_clipping(camera, time, report),
         exposure=exposure,
+        lens_radius=lens,
+        focus_distance=focus if lens > 0.0 else 1.0,
     )
 
 
