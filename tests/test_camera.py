@@ -200,3 +200,11 @@ def test_an_impossible_lens_is_an_error(wrong):
     scene = glowing(FLOOR, replace(ir.Camera.look_at((0, 0, 3), (0, 0, 0)), **wrong))
     with pytest.raises(ir.InputError, match="lens_radius"):
         render(scene, width=4, iterations=1)
+
+
+def test_a_camera_beyond_all_floats_is_an_error():
+    """A position of 1e300 is finite on the host, and nowhere on the device."""
+    camera = ir.Camera.look_at((0, 0, 3), (0, 0, 0))
+    camera.world_from_camera[0, 3] = 1e300
+    with pytest.raises(ir.InputError, match="too far"):
+        render(glowing(FLOOR, camera), width=4, iterations=1)

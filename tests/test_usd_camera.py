@@ -96,6 +96,12 @@ def test_an_empty_clipping_range_clips_nothing(tmp_path):
     assert scene.camera.clipping == (0.0, math.inf) and warned(scene, "/C", "clippingRange")
 
 
+def test_clipping_planes_are_named(tmp_path):
+    """What the picture will not lack is said."""
+    scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 1, 2)]"))
+    assert warned(scene, "/C", "clippingPlanes")
+
+
 @pytest.mark.parametrize("name", ["focalLength", "horizontalAperture", "verticalAperture"])
 @pytest.mark.parametrize("number", ["0", "-1", "nan", "inf"])
 def test_an_impossible_camera_is_an_error_that_names_it(tmp_path, name, number):

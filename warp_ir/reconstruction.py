@@ -327,10 +327,13 @@ class Reconstruction:
         """Adds one iteration's samples of irradiance over π."""
         self._launcher.launch(_observe, self._pixels, [self._surfaces, gbuffer, direct, indirect, self._seen])
 
+    def arrays(self) -> dict[str, Any]:
+        """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""
+        return {name: getattr(self._seen, name) for name in Observations.vars}
+
     def merge(self, other: "Reconstruction") -> None:
         """Adds another's samples."""
-        for name in Observations.vars:
-            mine, theirs = getattr(self._seen, name), getattr(other._seen, name)
+        for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())
 
     def resolve(self, film: Any, iterations: int) -> npt.NDArray[np.float32]:

@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -203,6 +205,12 @@ class Scene:
     """What was skipped, approximated or guessed: one line each, beginning with the prim's path."""
     stats: Mapping[str, int] = field(default_factory=dict)
     """Counts of what was read and what was skipped, for `--stats` and `warp-ir info`."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of `RenderSettings` that the file asks for; `render` without settings of yours does so."""
+    shutter: tuple["Scene", ...] = ()
+    """The scene at moments spread evenly over the time in which the camera's shutter is open, in order, a power of two
+    of them; empty: nothing moves. Iterations take them in turn. What does not move are the same objects in all of them.
+    """
 
     @property
     def triangle_count(self) -> int:
@@ -212,10 +220,10 @@ class Scene:
     def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper corner of the meshes' bounding box, float64 [3]; a unit cube if there are none."""
         # Only points that a triangle uses count: stray points must not move the scene's frame.
-        used = [mesh.points[np.unique(mesh.triangles)] for mesh in self.meshes if len(mesh.triangles)]
-        if not used:
+        boxes = [_box(mesh) for mesh in self.meshes if len(mesh.triangles)]
+        if not boxes:
             return np.full(3, -0.5), np.full(3, 0.5)
-        return np.min([p.min(axis=0) for p in used], axis=0), np.max([p.max(axis=0) for p in used], axis=0)
+        return np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
 
     @property
     def extent(self) -> float:
@@ -235,11 +243,26 @@ class Scene:
             area = _areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
             total += float(area.sum())
-            reflected += float(area @ rho)
+            reflected += float((area * rho).sum())
         return reflected / total if total > 0.0 else 0.0
+
+
+# A mesh that does not move is part of many scenes: what is computed of it is kept as long as it lives.
+_AREAS: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
+_BOXES: WeakKeyDictionary[Mesh, tuple[Floats, Floats]] = WeakKeyDictionary()
 
 
 def _areas(mesh: Mesh) -> Floats:
     """Areas of a mesh's triangles, float64 [m]."""
-    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if mesh not in _AREAS:
+        a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+        _AREAS[mesh] = np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return _AREAS[mesh]
+
+
+def _box(mesh: Mesh) -> tuple[Floats, Floats]:
+    """Lower and upper corner [3] of the points that the triangles use."""
+    if mesh not in _BOXES:
+        used = mesh.points[np.unique(mesh.triangles)]
+        _BOXES[mesh] = (used.min(axis=0), used.max(axis=0))
+    return _BOXES[mesh]
