@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -114,5 +114,7 @@ def _add(digest: Any, value: object, seen: dict[int, int]) -> None:
             _add(digest, item, seen)
     elif isinstance(value, frozenset | set):
         _add(digest, tuple(sorted(value)), seen)
+    elif isinstance(value, Mapping):
+        _add(digest, tuple(value.items()), seen)
     else:
         digest.update(repr(value).encode())
