@@ -42,9 +42,7 @@ CONNECTIONS = 1.9e11
 def _camera_rays(first: int, camera: CameraData, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3]) -> None:
     """The ray through the middle of every pixel."""
     i = first + wp.tid()
-    x = (float(i % camera.columns) + 0.5) / float(camera.columns)
-    y = (float(i // camera.columns) + 0.5) / float(camera.rows)
-    ray = camera_ray(camera, x, y)
+    ray = camera_ray(camera, i, wp.vec2(0.5, 0.5), wp.vec2(0.0, 0.0))
     origins[i] = ray.origin
     directions[i] = ray.direction
 
@@ -176,7 +174,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     launcher = Launcher(device)
     launcher.load([sys.modules[__name__]])
     uploaded = upload_scene(scene, launcher)
-    camera = camera_data(scene.camera, uploaded.frame, width, width, visible_lights=False)
+    camera = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=width, height=width))
     gbuffer = new_gbuffer(launcher, width * width)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(uploaded, launcher, paths=PATHS, absorption="roulette", max_bounces=None, scramble=1)
@@ -206,7 +204,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
         rows.append(row)
 
     side = max(1, width // 4)  # brute force is slow: a smaller picture will do
-    small = camera_data(scene.camera, uploaded.frame, side, side, visible_lights=False)
+    small = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=side, height=side))
     trace_primary(uploaded, small, launcher, gbuffer, iteration=0, seed=0)
     out = launcher.empty(side * side, wp.vec3)
     gather: dict[str, Any] = {"scene": name, "vpls": vpls.count}

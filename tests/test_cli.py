@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import warp_ir
+import warp_ir.usd.load
 from warp_ir import RenderSettings
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse, settings_of
@@ -159,10 +160,12 @@ def test_interruption_leaves_a_picture(tmp_path, number):
     assert process.stderr.read(5) == "begun"
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
-    assert err == "warp-ir: interrupted\n" and "iterations" in out
+    assert (
+        re.fullmatch(r"warp-ir: \S+: from here --resume goes on\nwarp-ir: interrupted\n", err) and "iterations" in out
+    )
     assert read_image(picture).shape == (8, 8, 4)
     assert json.loads(stats.read_text())["interrupted"] is True
-    assert sorted(os.listdir(tmp_path)) == ["a.exr", "s.json"]
+    assert sorted(os.listdir(tmp_path)) == ["a.exr", "a.exr.film.npz", "s.json"]
     assert process.returncode == 128 + number
 
 
@@ -179,10 +182,23 @@ class Interrupted:
         return math.nan
 
 
+class Stopped:
+    """A renderer that is stopped at once."""
+
+    def __init__(self, scene, settings, **_):
+        self.wanted = self.settings = settings
+
+    def new_film(self):
+        return Interrupted()
+
+    def render(self, film, progress):
+        return film
+
+
 def test_interruption_before_the_first_iteration(tmp_path, monkeypatch, capsys):
     """There is no picture yet: the old file stays, and the message says that nothing was written."""
     (tmp_path / "a.png").write_text("old")
-    monkeypatch.setattr(warp_ir, "render", lambda *args, **kwargs: Interrupted())
+    monkeypatch.setattr(warp_ir, "Renderer", Stopped)
     assert main(["render", ROOM, str(tmp_path / "a.png"), "--device", "cpu"]) == 130
     captured = capsys.readouterr()
     assert captured.out == "" and "nothing written" in captured.err
@@ -192,7 +208,7 @@ def test_interruption_before_the_first_iteration(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interruption_while_loading(tmp_path, monkeypatch, capsys, number, code):
     """Outside of the renderer, too, both signals end the command in one line."""
-    monkeypatch.setattr(warp_ir, "load_usd", lambda *args, **kwargs: os.kill(os.getpid(), number))
+    monkeypatch.setattr(warp_ir.usd.load, "StageReader", lambda *args, **kwargs: os.kill(os.getpid(), number))
     assert main(["info", ROOM]) == code
     assert capsys.readouterr().err in ("warp-ir: interrupted\n", "warp-ir: terminated\n")
 
@@ -256,7 +272,7 @@ def test_internal_errors_are_one_line(capsys, monkeypatch):
     def broken(*args, **kwargs):
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr(warp_ir, "load_usd", broken)
+    monkeypatch.setattr(warp_ir.usd.load, "StageReader", broken)
     line = error_of(capsys, "info", ROOM, code=1)
     assert line == "warp-ir: internal error: RuntimeError: two lines (--verbose shows where)\n"
     assert main(["info", ROOM, "--verbose"]) == 1
@@ -269,7 +285,7 @@ def test_out_of_memory_is_one_line(capsys, monkeypatch):
     def hungry(*args, **kwargs):
         raise MemoryError
 
-    monkeypatch.setattr(warp_ir, "load_usd", hungry)
+    monkeypatch.setattr(warp_ir.usd.load, "StageReader", hungry)
     assert "out of memory" in error_of(capsys, "info", ROOM, code=1)
 
 
@@ -390,7 +406,8 @@ def _every_flag():
         if name not in ("visible_lights",) and not isinstance(value, bool):
             given = {None: "1"}.get(value, str(value))
             given = "roulette" if name == "absorption" else given
-            words += [f"--{name.replace('_', '-')}", given]
+            many = [str(x) for x in value] if isinstance(value, tuple) else [given]
+            words += [f"--{name.replace('_', '-')}", *many]
         elif isinstance(value, bool):
             words.append(f"--{name.replace('_', '-')}")
     return words

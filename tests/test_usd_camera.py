@@ -76,16 +76,30 @@ def test_exposure_controls_scale_the_film(tmp_path):
     assert load(tmp_path, camera_text(more)).camera.exposure == pytest.approx(1.5 * 0.5 * 2 * 8 / 4)
 
 
-def test_depth_of_field_and_motion_blur_are_named(tmp_path):
-    """What the picture will lack is said."""
-    scene = load(tmp_path, camera_text("float fStop = 2\n double shutter:close = 0.5"))
-    assert warned(scene, "/C", "depth of field") and warned(scene, "/C", "motion blur")
+def test_the_lens_is_focal_length_over_f_stop_wide(tmp_path):
+    """Its radius is half of that, in scene units: the focal length is in tenths of one. No fStop, no lens."""
+    camera = load(tmp_path, camera_text("float fStop = 2\n float focalLength = 80\n float focusDistance = 7")).camera
+    assert camera.lens_radius == pytest.approx(80 * 0.1 / 2 / 2) and camera.focus_distance == 7.0
+    assert load(tmp_path, camera_text("float focusDistance = 7")).camera.lens_radius == 0.0
+
+
+@pytest.mark.parametrize("more", ["", 'token projection = "orthographic"\n float focusDistance = 7'])
+def test_a_lens_that_cannot_be_is_named(tmp_path, more):
+    """Without a focus distance, or without perspective, an fStop blurs nothing."""
+    scene = load(tmp_path, camera_text("float fStop = 2\n" + more))
+    assert scene.camera.lens_radius == 0.0 and warned(scene, "/C", "no depth of field")
 
 
 def test_an_empty_clipping_range_clips_nothing(tmp_path):
     """A far plane before the near plane would hide everything."""
     scene = load(tmp_path, camera_text("float2 clippingRange = (5, 1)"))
     assert scene.camera.clipping == (0.0, math.inf) and warned(scene, "/C", "clippingRange")
+
+
+def test_clipping_planes_are_named(tmp_path):
+    """What the picture will not lack is said."""
+    scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 1, 2)]"))
+    assert warned(scene, "/C", "clippingPlanes")
 
 
 @pytest.mark.parametrize("name", ["focalLength", "horizontalAperture", "verticalAperture"])

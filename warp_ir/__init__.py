@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from warp_ir.scene import Projection as Projection
     from warp_ir.scene import Scene as Scene
     from warp_ir.settings import RenderSettings as RenderSettings
+    from warp_ir.usd import StageReader as StageReader
     from warp_ir.usd import load_usd as load_usd
 
 __version__ = "0.1.0"
@@ -35,6 +36,7 @@ _HOME = {
     "Scene": "scene",
     "RenderSettings": "settings",
     "load_usd": "usd",
+    "StageReader": "usd",
     "Film": "film",
     "Renderer": "renderer",
     "render": "renderer",

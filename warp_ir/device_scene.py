@@ -6,7 +6,8 @@ so nothing else has to know; and a scene in millimetres, or far from the origin,
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from warp_ir import sampling
 from warp_ir.bvh import Bvh, build_bvh
 from warp_ir.launch import Launcher
 from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Projection, Scene
+from warp_ir.settings import RenderSettings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,8 +72,12 @@ class SceneData:
 class CameraData:
     """A camera in the scene's device frame, and the image it fills."""
 
-    columns: int
+    columns: int  # of the film: the whole image, or the data window in it
     rows: int
+    first_column: int  # of the film in the image
+    first_row: int
+    image_columns: int
+    image_rows: int
     shows_lights: int  # 1: analytic lights are visible
     origin: wp.vec3
     right: wp.vec3
@@ -84,6 +90,9 @@ class CameraData:
     near: float
     far: float
     orthographic: int
+    lens_radius: float  # 0: a pinhole
+    focus: float  # depth of the plane that is sharp
+    blurs: int  # 1: the rays of a pixel differ in more than where they cross it
 
 
 @dataclass(frozen=True)
@@ -120,7 +129,9 @@ class DeviceScene:
     emits: bool
     """Whether anything in the scene emits."""
     keep: tuple[Any, ...]
-    """The mesh and BVH objects: a struct holds only their ids, and a freed id crashes."""
+    """The owners of the surfaces and of the lights: a struct holds only their ids, and a freed id crashes."""
+    source: Scene
+    """What was uploaded."""
 
 
 def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
@@ -129,67 +140,129 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
     Raises:
         InputError: An array has the wrong shape or a bad value; the message names the mesh or light.
     """
+    return upload_moments((scene,), launcher)[0]
+
+
+def upload_moments(
+    scenes: Sequence[Scene], launcher: Launcher, previous: Sequence[DeviceScene] = ()
+) -> list[DeviceScene]:
+    """Checks scenes and copies them to the launcher's device, into one frame.
+
+    What a scene shares with another of them, or with a `previous` one, is uploaded once: surfaces if their meshes
+    are the same objects and their materials are equal, lights if they are the same objects.
+
+    Raises:
+        InputError: As for `upload_scene`.
+    """
     with launcher.phase("upload"):
-        _check(scene)
-        lower, upper = scene.bounds()
-        extent = float(np.linalg.norm(upper - lower))
-        if not np.isfinite(extent):
-            raise InputError("scene: its extent is too large for a float")
-        # Rooms of exactly 2^k units must not jump between scales by rounding: frexp is exact.
-        scale = 2.0 ** -math.frexp(extent)[1] if extent > 0.0 else 1.0
-        frame = DeviceFrame(0.5 * (lower + upper), scale)
-
-        data = SceneData()
-        data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
-        mesh = _upload_surfaces(scene, frame, data, launcher)
-        shapes = _upload_lights(scene.lights, frame, data, launcher)
-        _upload_emitters(scene, frame, data, launcher)
-        data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
-        colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
-        used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
-        return DeviceScene(
-            data=data,
-            frame=frame,
-            extent=extent * scale if extent > 0.0 else 1.0,
-            area=scene.area() * scale**2,
-            mean_albedo=scene.mean_albedo(),
-            max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
-            emits=data.emitter_count > 0,
-            keep=(mesh, shapes),
-        )
+        checked = {id(mesh) for other in previous for mesh in other.source.meshes}
+        for scene in scenes:
+            _check(scene, checked)
+            checked |= {id(mesh) for mesh in scene.meshes}
+        boxes = [scene.bounds() for scene in scenes]
+        lower, upper = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        done: list[DeviceScene] = []
+        for scene in scenes:
+            done.append(_upload(scene, lower, upper, launcher, [*done, *previous]))
+        return done
 
 
-def camera_data(camera: Camera, frame: DeviceFrame, width: int, height: int, *, visible_lights: bool) -> Any:
-    """The `CameraData` of a camera fitted to an image of `width` x `height` pixels.
+def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: list[DeviceScene]) -> DeviceScene:
+    """One scene into the frame of a bounding box; `others` may have parts of it."""
+    extent = float(np.linalg.norm(upper - lower))
+    if not np.isfinite(extent):
+        raise InputError("scene: its extent is too large for a float")
+    # Rooms of exactly 2^k units must not jump between scales by rounding: frexp is exact.
+    scale = 2.0 ** -math.frexp(extent)[1] if extent > 0.0 else 1.0
+    frame = DeviceFrame(0.5 * (lower + upper), scale)
+    # All of a scene is in its frame: in another one nothing can be used again.
+    others = [o for o in others if o.frame.scale == scale and (o.frame.origin == frame.origin).all()]
+    surfaces = next((o for o in others if _same_surfaces(o.source, scene)), None)
+    lights = next((o for o in others if _same(o.source.lights, scene.lights)), None)
+    if surfaces is not None and surfaces is lights:
+        return replace(surfaces, source=scene)
+
+    data = SceneData()
+    if surfaces is not None:
+        for name in SceneData.vars:
+            setattr(data, name, getattr(surfaces.data, name))
+    data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
+    mesh = surfaces.keep[0] if surfaces is not None else _upload_surfaces(scene, frame, data, launcher)
+    shapes = _upload_lights(scene.lights, frame, data, launcher)
+    _upload_emitters(scene, frame, data, launcher)
+    data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+    colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
+    used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
+    return DeviceScene(
+        data=data,
+        frame=frame,
+        extent=extent * scale if extent > 0.0 else 1.0,
+        area=scene.area() * scale**2,
+        mean_albedo=scene.mean_albedo(),
+        max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
+        emits=data.emitter_count > 0,
+        keep=(mesh, shapes),
+        source=scene,
+    )
+
+
+def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+
+
+def _same_surfaces(one: Scene, other: Scene) -> bool:
+    """Whether two scenes have the same meshes and equal materials."""
+    return _same(one.meshes, other.meshes) and (one.materials is other.materials or one.materials == other.materials)
+
+
+def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> Any:
+    """The `CameraData` of a camera fitted to the image that the settings describe; their height must be set.
 
     Raises:
         InputError: The window is empty, or something is not finite.
     """
-    camera = camera.fit(width, height)
-    left, right, bottom, top = camera.window
+    assert settings.height is not None
     if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.window).all()):
         raise InputError(f"camera {camera.name!r}: transform and window must be finite")
+    left, right, bottom, top = camera.window
     if not (right > left and top > bottom):
         raise InputError(f"camera {camera.name!r}: the window is empty")
-    unit = 1.0 if camera.projection == Projection.PERSPECTIVE else frame.scale
+    perspective = camera.projection == Projection.PERSPECTIVE
+    lens = camera.lens_radius if perspective and settings.depth_of_field else 0.0
+    if not (0.0 <= lens < np.inf and (lens == 0.0 or 0.0 < camera.focus_distance < np.inf)):
+        raise InputError(f"camera {camera.name!r}: lens_radius and focus_distance must be finite and not negative")
+    fitted = camera.fit(settings.width, settings.height, settings.conform, settings.pixel_aspect)
+    left, right, bottom, top = fitted.window
+    unit = 1.0 if perspective else frame.scale
     out = CameraData()
-    out.columns, out.rows, out.shows_lights = width, height, int(visible_lights)
-    out.origin = wp.vec3(*frame.to_device(camera.world_from_camera[:3, 3]))
+    out.first_column, out.first_row, out.columns, out.rows = settings.pixels()
+    out.image_columns, out.image_rows = settings.width, settings.height
+    out.shows_lights = int(settings.visible_lights)
+    with np.errstate(over="ignore"):
+        origin = frame.to_device(camera.world_from_camera[:3, 3])
+    if not np.isfinite(origin).all():
+        raise InputError(f"camera {camera.name!r}: it is too far from the scene")
+    out.origin = wp.vec3(*origin)
     out.right, out.up, out.back = (wp.vec3(*camera.world_from_camera[:3, k]) for k in range(3))
     out.left, out.bottom = left * unit, bottom * unit
     out.width, out.height = (right - left) * unit, (top - bottom) * unit
     out.near = camera.clipping[0] * frame.scale
     out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
-    out.orthographic = int(camera.projection == Projection.ORTHOGRAPHIC)
+    out.orthographic = int(not perspective)
+    out.lens_radius, out.focus = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
+    out.blurs = int(lens > 0.0)
     return out
 
 
-def _check(scene: Scene) -> None:
-    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here."""
+def _check(scene: Scene, checked: Collection[int]) -> None:
+    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here, but meshes `checked` before."""
     if scene.triangle_count > MAX_TRIANGLES:
         raise InputError(f"scene: {scene.triangle_count} triangles; the limit is {MAX_TRIANGLES}")
     for mesh in scene.meshes:
-        _check_mesh(mesh, len(scene.materials))
+        if id(mesh) not in checked:
+            _check_mesh(mesh)
+        if len(mesh.triangles) and not 0 <= mesh.material.min() <= mesh.material.max() < len(scene.materials):
+            raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     for material in scene.materials:
         if not all(0.0 <= a <= 1.0 for a in material.albedo):
             raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
@@ -202,7 +275,7 @@ def _check(scene: Scene) -> None:
             raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
 
 
-def _check_mesh(mesh: Mesh, material_count: int) -> None:
+def _check_mesh(mesh: Mesh) -> None:
     count = len(mesh.triangles)
 
     def demand(good: Any, what: str) -> None:
@@ -216,10 +289,6 @@ def _check_mesh(mesh: Mesh, material_count: int) -> None:
         demand(
             mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.points),
             f"triangles refer to points outside 0..{len(mesh.points) - 1}",
-        )
-        demand(
-            mesh.material.min() >= 0 and mesh.material.max() < material_count,
-            f"material refers to materials outside 0..{material_count - 1}",
         )
         demand(np.isfinite(mesh.points[mesh.triangles]).all(), "points must be finite")
     for name, corners in (("normals", mesh.normals), ("colors", mesh.colors)):

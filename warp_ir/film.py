@@ -5,6 +5,8 @@ Sums are float64, so that a hundred thousand iterations leave no drift.
 
 import math
 import os
+import zipfile
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,8 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 """What `Film.aov` can give beside the radiance."""
 Image = npt.NDArray[Any]
 _RADIANCE = ("emission", "direct", "indirect")
+_SEEN = "seen_"
+"""What the names of the filter's arrays begin with in a file."""
 
 
 @wp.struct
@@ -241,13 +245,39 @@ class Film:
         """Samples that were not finite and count as black; 0 unless something is wrong."""
         return int(self._data.rejected.numpy().sum())
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the film, sums and all, as .npz: `load` gives it back bit for bit."""
+    def save(self, path: str | os.PathLike[str], key: str = "") -> None:
+        """Writes the film, sums and all, as .npz: `load` and `resume` give it back bit for bit.
+
+        Args:
+            path: The file.
+            key: Says what it is a film of; `resume` compares it.
+        """
         arrays = {name: getattr(self._data, name).numpy() for name in FilmData.vars}
+        if self.reconstruction is not None:
+            arrays |= {_SEEN + name: array.numpy() for name, array in self.reconstruction.arrays().items()}
         origin, scale = (self._frame.origin, self._frame.scale) if self._frame is not None else (np.zeros(3), 1.0)
         size = np.array([self.width, self.height, self.iterations])
         with open(path, "wb") as file:
-            np.savez(file, size=size, seconds=self.seconds, origin=origin, scale=scale, **arrays)
+            np.savez(file, key=key, size=size, seconds=self.seconds, origin=origin, scale=scale, **arrays)
+
+    def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
+        """Goes on where a film was when `save` wrote it: this one, empty and of the same scene, becomes that one.
+
+        Raises:
+            InputError: The file is missing, is no film, or is one of something else.
+        """
+        wanted = {name: getattr(self._data, name) for name in FilmData.vars}
+        if self.reconstruction is not None:
+            wanted |= {_SEEN + name: array for name, array in self.reconstruction.arrays().items()}
+        about = _read(path, ["key", "size", "seconds"])
+        if str(about["key"]) != key or about["size"][:2].tolist() != [self.width, self.height]:
+            raise InputError(f"{os.fspath(path)}: a film of another scene, or with other settings")
+        arrays = _read(path, [*wanted])
+        if any(arrays[name].shape[0] != array.shape[0] for name, array in wanted.items()):
+            raise InputError(f"{os.fspath(path)}: not a film: its arrays differ in size")
+        for name, array in wanted.items():
+            array.assign(arrays[name])
+        self.iterations, self.seconds = int(about["size"][2]), float(about["seconds"])
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
@@ -258,11 +288,7 @@ class Film:
         """
         from warp_ir.device_scene import DeviceFrame
 
-        try:
-            with np.load(path) as file:
-                arrays = {name: file[name] for name in (*FilmData.vars, "size", "seconds", "origin", "scale")}
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(f"{os.fspath(path)}: not a film: {error}") from error
+        arrays = _read(path, [*FilmData.vars, "size", "seconds", "origin", "scale"])
         width, height, iterations = (int(x) for x in arrays["size"])
         film = Film(width, height, Launcher(device), DeviceFrame(arrays["origin"], float(arrays["scale"])))
         film.iterations, film.seconds = iterations, float(arrays["seconds"])
@@ -274,3 +300,12 @@ class Film:
         """The mean per iteration of the sum of some tables, float64 [height, width, 3]."""
         total = np.sum([getattr(self._data, name).numpy() for name in names], axis=0)
         return np.asarray(total / max(self.iterations, 1)).reshape(self.height, self.width, 3)
+
+
+def _read(path: str | os.PathLike[str], names: Sequence[str]) -> dict[str, Any]:
+    """Arrays of a file that `Film.save` wrote."""
+    try:
+        with open(path, "rb") as stream, np.load(stream) as file:
+            return {name: file[name] for name in names}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{os.fspath(path)}: not a film: {error}") from error

@@ -1,7 +1,8 @@
 """What the camera sees: one jittered ray per pixel, and the surface it meets.
 
 The jitter of a pixel is a (0,2)-sequence over the iterations, scrambled by pixel: the first 2^k iterations
-sample the pixel's area in as many strata, so edges converge faster than noise.
+sample the pixel's area in as many strata, so edges converge faster than noise. The next two dimensions choose
+the point on the lens, if the camera has one.
 """
 
 from typing import Any
@@ -41,8 +42,13 @@ class Ray:
 
 
 @wp.func
-def camera_ray(camera: CameraData, x: float, y: float) -> Ray:
-    """The ray through film position (x, y) in [0, 1]², (0, 0) being the top left."""
+def camera_ray(camera: CameraData, pixel: int, u: wp.vec2, lens: wp.vec2) -> Ray:
+    """The ray through the point `u` in [0, 1]² of a pixel of the film, from the point `lens` of the unit disk.
+
+    (0, 0) is the top left of the pixel; rays through one point of the film meet where the camera is in focus.
+    """
+    x = (float(camera.first_column + pixel % camera.columns) + u[0]) / float(camera.image_columns)
+    y = (float(camera.first_row + pixel // camera.columns) + u[1]) / float(camera.image_rows)
     right = camera.left + x * camera.width
     up = camera.bottom + (1.0 - y) * camera.height
     ray = Ray()
@@ -51,9 +57,17 @@ def camera_ray(camera: CameraData, x: float, y: float) -> Ray:
         ray.origin = camera.origin + on_film
         ray.direction = -camera.back
     else:
-        ray.origin = camera.origin
-        ray.direction = on_film - camera.back
+        aside = (lens[0] * camera.right + lens[1] * camera.up) * camera.lens_radius
+        ray.origin = camera.origin + aside
+        ray.direction = on_film - camera.back - aside / camera.focus
     return ray
+
+
+@wp.func
+def image_pixel(camera: CameraData, pixel: int) -> int:
+    """Number of a pixel of the film in the whole image: what its random numbers depend on, wherever it is cut."""
+    column = camera.first_column + pixel % camera.columns
+    return (camera.first_row + pixel // camera.columns) * camera.image_columns + column
 
 
 @wp.struct
@@ -103,12 +117,14 @@ def _trace_primary(
     """One camera ray and what it meets."""
     pixel = first + wp.tid()
     jitter = wp.vec2(0.5, 0.5)
+    lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
-        scramble = sampling.hash_combine(sampling.hash_combine(seed, wp.uint32(pixel)), _JITTER)
+        stream = sampling.hash_combine(seed, wp.uint32(image_pixel(camera, pixel)))
+        scramble = sampling.hash_combine(stream, _JITTER)
         jitter = sampling.sample_2d(scene.sobol, iteration, 0, scramble)
-    x = (float(pixel % camera.columns) + jitter[0]) / float(camera.columns)
-    y = (float(pixel // camera.columns) + jitter[1]) / float(camera.rows)
-    sight = see(scene, camera, camera_ray(camera, x, y))
+        if camera.lens_radius > 0.0:
+            lens = sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, scramble))
+    sight = see(scene, camera, camera_ray(camera, pixel, jitter, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
     gbuffer.normal[pixel] = sight.normal

@@ -93,7 +93,8 @@ def write_image(
     if isinstance(source, np.ndarray) and (aov or aovs):
         raise InputError(f"{path}: an array has no AOVs; write a film")
     if suffix == ".exr":
-        _write_exr(path, _exr_layers(source, aov, aovs), half, _attributes(source, metadata or {}))
+        layers = _exr_layers(source, aov, aovs)
+        _write_exr(path, layers, half, _attributes(source, metadata or {}), _windows(source))
         return [path]
     _write_flat(path, source, exposure, tonemap, aov)
     beside = [aov_path(path, name) for name in aovs]
@@ -246,7 +247,18 @@ def _exr_layers(source: "_Film | Array", aov: str | None, aovs: Sequence[str]) -
     return layers
 
 
-def _write_exr(path: Path, layers: _Layers, half: bool, attributes: dict[str, Any]) -> None:
+def _windows(source: "_Film | Array") -> tuple[int, int, int, int] | None:
+    """Where a film's pixels belong: left column and top row in an image of so many columns and rows."""
+    settings = None if isinstance(source, np.ndarray) else source.settings
+    if settings is None or settings.height is None:
+        return None
+    left, top, _, _ = settings.pixels()
+    return left, top, settings.width, settings.height
+
+
+def _write_exr(
+    path: Path, layers: _Layers, half: bool, attributes: dict[str, Any], windows: tuple[int, int, int, int] | None
+) -> None:
     import OpenImageIO as oiio
 
     formats = [oiio.HALF if half and not exact else oiio.FLOAT for _, exact in layers.values()]
@@ -258,6 +270,8 @@ def _write_exr(path: Path, layers: _Layers, half: bool, attributes: dict[str, An
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])
     spec.channelformats = tuple(formats)
     spec.channelnames = tuple(layers)
+    if windows is not None:
+        spec.x, spec.y, spec.full_width, spec.full_height = windows
     for name, value in attributes.items():
         spec.attribute(name, value)
     _save(path, spec, pixels)
@@ -336,7 +350,9 @@ def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict
         known["estimated_error"] = source.error()
     attributes: dict[str, Any] = {"Software": f"warp_ir {__version__}"}
     for name, value in {**known, **metadata}.items():
-        if isinstance(value, bool | int) and abs(value) < 2**31:
+        if name == "pixel_aspect":
+            attributes["PixelAspectRatio"] = float(str(value))
+        elif isinstance(value, bool | int) and abs(value) < 2**31:
             attributes[f"warp_ir:{name}"] = int(value)
         elif isinstance(value, int | float):
             attributes[f"warp_ir:{name}"] = float(value)

@@ -42,6 +42,12 @@ class Profile:
         """Adds time that was measured elsewhere."""
         self._seconds[name] += seconds
 
+    def clear(self) -> None:
+        """Forgets all of it."""
+        self.seconds()
+        self._seconds.clear()
+        self.counts.clear()
+
     def seconds(self) -> dict[str, float]:
         """Seconds so far, by phase. Waits for the GPU's pending work."""
         if self._pending:

@@ -4,6 +4,9 @@ A pixel stands for the surface seen through its centre. Samples of irradiance th
 filtered (`filter`): no pixel mixes surfaces, so edges do not stop the filter. What a pixel on an edge shows is then
 found by many cheap camera rays, each taking the irradiance of the neighbouring pixel whose surface it meets.
 
+Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Then only the pixels that have
+met nothing but the surface in their centre are filtered; the others keep their plain mean.
+
 Where the result differs from the plain mean by more than the noise explains, the mean is believed: the bias vanishes
 with the noise.
 """
@@ -18,7 +21,7 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film import FilmData
 from warp_ir.filter import Layer, Surfaces, filter_layer, mean_channel, new_layer, same_surface
-from warp_ir.gbuffer import GBuffer, Sight, camera_ray, see, trace_primary
+from warp_ir.gbuffer import GBuffer, Sight, camera_ray, image_pixel, see, trace_primary
 from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
@@ -54,7 +57,7 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
     if gbuffer.mesh[p] >= 0:
         surfaces.position[p] = gbuffer.position[p]
         surfaces.normal[p] = gbuffer.shading_normal[p]
-        size = camera.height / float(camera.rows)
+        size = camera.height / float(camera.image_rows)
         surfaces.footprint[p] = size * wp.where(camera.orthographic == 1, 1.0, gbuffer.depth[p])
 
 
@@ -136,6 +139,16 @@ def _spread(seen: Observations, q: int) -> wp.vec2:
     d = mean_channel(seen.direct[q])
     i = mean_channel(seen.indirect[q])
     return wp.max(seen.squares[q] - wp.vec2(d * d, i * i) / float(seen.count[q]), wp.vec2(0.0))
+
+
+@wp.kernel
+def _leave_out(first: int, seen: Observations, iterations: int, layer: Layer) -> None:
+    """Makes a background of the pixels in which an iteration has seen more than the surface in their centre."""
+    p = first + wp.tid()
+    if seen.count[p] != iterations:
+        seen.surfaces.footprint[p] = 0.0
+        layer.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+        layer.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
 
 
 @wp.struct
@@ -252,16 +265,14 @@ def _look_closely(
     surfaces = seen.surfaces
     row = p // camera.columns
     column = p - row * camera.columns
-    scramble = sampling.hash_combine(wp.uint32(p), _EDGE_JITTER)
+    scramble = sampling.hash_combine(wp.uint32(image_pixel(camera, p)), _EDGE_JITTER)
     first_albedo = wp.vec3(0.0)
     first_emission = wp.vec3(0.0)
     mixed = bool(False)
     out = _Pixel()
     while out.rays < most and (mixed or out.rays < _PROBES):
         u = sampling.sample_2d(scene.sobol, out.rays, 0, scramble)
-        x = (float(column) + u[0]) / float(camera.columns)
-        y = (float(row) + u[1]) / float(camera.rows)
-        point = see(scene, camera, camera_ray(camera, x, y))
+        point = see(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
         if out.rays == 0:
             first_albedo = point.albedo
             first_emission = point.emission
@@ -310,7 +321,7 @@ def _compose(
     albedo = film.albedo[p] * share
     direct = raw_direct
     indirect = raw_indirect
-    if _on_edge(surfaces, film, p):
+    if camera.blurs == 0 and _on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
         own = _Lit()
         own.weight = float(seen.other_count[p])
@@ -362,27 +373,43 @@ class Reconstruction:
                 setattr(seen, name, launcher.zeros(pixels, wp.vec3))
             seen.squares = launcher.zeros(pixels, wp.vec2)
             seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
-            self._surfaces, self._seen = surfaces, seen
+            self._seen = seen
 
     def observe(self, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Adds one iteration's samples of irradiance over π."""
         self._launcher.launch(_observe, self._pixels, [gbuffer, direct, indirect, self._seen])
 
+    def arrays(self) -> dict[str, Any]:
+        """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""
+        return {name: getattr(self._seen, name) for name in Observations.vars if name != "surfaces"}
+
     def merge(self, other: "Reconstruction") -> None:
         """Adds another's samples."""
-        for name in Observations.vars.keys() - {"surfaces"}:
-            mine, theirs = getattr(self._seen, name), getattr(other._seen, name)
+        for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())
 
     def resolve(self, film: Any, iterations: int) -> npt.NDArray[np.float32]:
         """Radiance by way of lights and of surfaces, float32 [2, rows, columns, 3], from a `FilmData`."""
         launcher, pixels = self._launcher, self._pixels
         with launcher.phase("filter"):
-            layer = new_layer(pixels, launcher)
-            launcher.launch(_average, pixels, [self._surfaces, self._seen, layer])
-            layer = filter_layer(self._surfaces, layer, launcher)
+            seen, layer = self._seen, new_layer(pixels, launcher)
+            launcher.launch(_average, pixels, [seen.surfaces, seen, layer])
+            if self._camera.blurs:
+                seen = _copy(Observations, seen)
+                seen.surfaces = _copy(Surfaces, seen.surfaces)
+                seen.surfaces.footprint = wp.clone(seen.surfaces.footprint)
+                launcher.launch(_leave_out, pixels, [seen, iterations, layer])
+            layer = filter_layer(seen.surfaces, layer, launcher)
             out = launcher.empty((2, pixels), wp.vec3)
             rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
-            launcher.launch(_compose, pixels, [self._scene.data, self._camera, self._seen, layer, film, weight, out])
+            launcher.launch(_compose, pixels, [self._scene.data, self._camera, seen, layer, film, weight, out])
             return np.asarray(out.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
+
+
+def _copy(kind: Any, record: Any) -> Any:
+    """Another record of some kind, of the same arrays."""
+    copy = kind()
+    for name in kind.vars:
+        setattr(copy, name, getattr(record, name))
+    return copy

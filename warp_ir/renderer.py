@@ -33,7 +33,7 @@ import warp_ir.gbuffer
 import warp_ir.reconstruction
 import warp_ir.vpl
 from warp_ir.denoise import require_denoiser
-from warp_ir.device_scene import camera_data, upload_scene
+from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
@@ -79,44 +79,132 @@ class Renderer:
         Raises:
             InputError: The scene, the settings or the device cannot be used.
         """
-        height = settings.height or max(1, round(settings.width / scene.camera.aspect))
-        self.settings = replace(settings, height=height)  # checks the number of pixels again
+        self.wanted = settings
+        """The settings as given; in `settings` the height is definite."""
+        self.settings = _with_height(settings, scene)
         if settings.denoise:
             require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
-        needed, there = settings.width * height * _BYTES_PER_PIXEL, self.launcher.memory()
+        self._check_memory()
+        self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
+        self._moments: list[_Moment] = []
+        self._gbuffer: Any = None
+        self._take(scene)
+
+    def update(self, scene: Scene) -> None:
+        """Takes another scene in place of its own, and uploads what the two do not share.
+
+        Films of the old one are not to be added to.
+
+        Raises:
+            InputError: The scene cannot be used.
+        """
+        self.launcher.profile.clear()
+        self.settings = _with_height(self.wanted, scene)
+        self._check_memory()
+        self._take(scene)
+
+    def _take(self, scene: Scene) -> None:
+        settings, launcher = self.settings, self.launcher
+        if len(scene.shutter) & (len(scene.shutter) - 1):
+            raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
+        scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
+        uploaded = upload_moments(scenes, launcher, list({id(m.scene): m.scene for m in self._moments}.values()))
+        self._moments = []
+        for moment, data in zip(scenes, uploaded, strict=True):
+            camera = camera_data(moment.camera, data.frame, settings)
+            camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
+            estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
+            self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
+        pixels = camera.columns * camera.rows
+        if self._gbuffer is None or self._gbuffer.mesh.shape[0] != pixels:
+            self._gbuffer = new_gbuffer(launcher, pixels)
+            self._direct, self._indirect = launcher.empty(pixels, wp.vec3), launcher.empty(pixels, wp.vec3)
+
+    def _check_memory(self) -> None:
+        _, _, columns, rows = self.settings.pixels()
+        needed, there = columns * rows * _BYTES_PER_PIXEL, self.launcher.memory()
         if needed > there:
             raise InputError(
-                f"width: {settings.width} x {height} pixels need about {needed / 2**30:.0f} GiB,"
+                f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
                 f" {self.launcher.device} has {there / 2**30:.0f}"
             )
-        self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
-        self.scene = upload_scene(scene, self.launcher)
-        self._exposure = scene.camera.exposure
-        self._camera = camera_data(
-            scene.camera, self.scene.frame, settings.width, height, visible_lights=settings.visible_lights
-        )
-        self._estimator = ESTIMATORS[settings.estimator](self.scene, self._camera, self.settings, self.launcher)
-        pixels = settings.width * height
-        self._gbuffer = new_gbuffer(self.launcher, pixels)
-        self._direct = self.launcher.empty(pixels, wp.vec3)
-        self._indirect = self.launcher.empty(pixels, wp.vec3)
+
+    @property
+    def scene(self) -> DeviceScene:
+        """The scene on the device; the first moment of one with motion blur."""
+        return self._moments[0].scene
 
     def new_film(self) -> Film:
         """An empty film of the right size."""
-        assert self.settings.height is not None
-        film = Film(self.settings.width, self.settings.height, self.launcher, self.scene.frame)
+        first = self._moments[0]
+        film = Film(first.camera.columns, first.camera.rows, self.launcher, first.scene.frame)
         film.settings = self.settings
         if self.settings.filter and self.settings.estimator == "vpl" and not self.settings.denoise:
-            film.reconstruction = Reconstruction(self.scene, self._camera, self.launcher, self._gbuffer, self._exposure)
+            film.reconstruction = Reconstruction(
+                first.scene, first.camera, self.launcher, self._gbuffer, first.exposure
+            )
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
-        self._estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
+        # Bit-reversed, so that any 2^k iterations that follow each other are spread over the shutter's time.
+        bits = len(self._moments).bit_length() - 1
+        moment = self._moments[int(f"{iteration % (1 << bits):0{bits}b}"[::-1], 2) if bits else 0]
+        moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
         with self.launcher.phase("film"):
-            film.add(self._gbuffer, self._direct, self._indirect, self._exposure)
+            film.add(self._gbuffer, self._direct, self._indirect, moment.exposure)
         wp.synchronize_device(self.launcher.device)
+
+    def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:
+        """Adds iterations to a film until one of the settings' limits is reached.
+
+        SIGINT (Ctrl-C) and SIGTERM end it early: the film holds the iterations done so far and says `interrupted`.
+
+        Args:
+            film: From `new_film`, to go on with; None: a new one.
+            progress: Called after every iteration.
+        """
+        film = film or self.new_film()
+        start = time.perf_counter() - film.seconds
+        with _signals_cancel(self.launcher, film):
+            checked, error = 0, math.nan
+            done = film.iterations
+            while not film.interrupted and film.iterations < self.settings.iteration_limit:
+                try:
+                    self.add_iteration(film, film.iterations)
+                except Cancelled:
+                    break
+                film.seconds = time.perf_counter() - start
+                # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
+                if film.iterations >= max(2, checked + checked // 8 + 1):
+                    checked, error = film.iterations, film.error()
+                report = _progress(film, self.settings, error, self._filter_seconds(film, film.iterations - done))
+                if progress is not None:
+                    progress(report)
+                if report.fraction >= 1.0:
+                    break
+        film.radiance()  # filtered now, and remembered: it belongs to the render and its time
+        film.seconds = time.perf_counter() - start
+        film.timings = self.launcher.profile.seconds()
+        film.counts = {"iterations": film.iterations, **self.launcher.profile.counts}
+        return film
+
+    def _filter_seconds(self, film: Film, iterations: int) -> float:
+        """What filtering will take [s]: about as much as 16 passes of camera rays, edges included."""
+        if film.reconstruction is None:
+            return 0.0
+        return 16.0 * self.launcher.profile.seconds().get("primary", 0.0) / iterations
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """The scene while the shutter is open: all of it, or one of the moments that stand for the time."""
+
+    scene: DeviceScene
+    camera: Any
+    estimator: Any
+    exposure: float
 
 
 def render(
@@ -132,38 +220,21 @@ def render(
 
     Args:
         scene: What to render, from `load_usd` or made by hand.
-        settings: How; the defaults if None.
+        settings: How; what the scene's file asks for (`Scene.settings`), and else the defaults, if None.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called after every iteration.
 
     Raises:
         InputError: The scene, the settings or the device cannot be used; the message says why in one line.
     """
-    renderer = Renderer(scene, settings or RenderSettings(), device=device)
-    settings = renderer.settings
-    start = time.perf_counter()
-    film = renderer.new_film()
-    with _signals_cancel(renderer.launcher, film):
-        checked, error = 0, math.nan
-        while not film.interrupted:
-            try:
-                renderer.add_iteration(film, film.iterations)
-            except Cancelled:
-                break
-            film.seconds = time.perf_counter() - start
-            # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
-            if film.iterations >= max(2, checked + checked // 8 + 1):
-                checked, error = film.iterations, film.error()
-            report = _progress(film, settings, error, _filter_seconds(renderer, film))
-            if progress is not None:
-                progress(report)
-            if report.fraction >= 1.0:
-                break
-    film.radiance()  # filtered now, and remembered: it belongs to the render and its time
-    film.seconds = time.perf_counter() - start
-    film.timings = renderer.launcher.profile.seconds()
-    film.counts = {"iterations": film.iterations, **renderer.launcher.profile.counts}
-    return film
+    renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
+    return renderer.render(progress=progress)
+
+
+def _with_height(settings: RenderSettings, scene: Scene) -> RenderSettings:
+    """The settings with a definite height, by default from the camera's aspect."""
+    height = settings.height or max(1, round(settings.width * settings.pixel_aspect / scene.camera.aspect))
+    return replace(settings, height=height)  # checks the number of pixels again
 
 
 def trace_vpls(
@@ -197,13 +268,6 @@ def _modules(estimator: str) -> list[Any]:
     if estimator == "keller":
         return [warp_ir.vpl, warp_ir.estimators.keller]
     return [warp_ir.estimators.path]
-
-
-def _filter_seconds(renderer: Renderer, film: Film) -> float:
-    """What filtering the picture will take [s]: about as much as 16 passes of camera rays, edges included."""
-    if film.reconstruction is None:
-        return 0.0
-    return 16.0 * renderer.launcher.profile.seconds().get("primary", 0.0) / film.iterations
 
 
 def _progress(film: Film, settings: RenderSettings, error: float, reserve: float) -> Progress:

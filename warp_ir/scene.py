@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,15 @@ import numpy.typing as npt
 Color = tuple[float, float, float]
 Floats = npt.NDArray[np.floating]
 Ints = npt.NDArray[np.integer]
+
+CONFORM_POLICIES = (
+    "expandAperture",
+    "cropAperture",
+    "adjustApertureWidth",
+    "adjustApertureHeight",
+    "adjustPixelAspectRatio",
+)
+"""How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
 
 
 class InputError(ValueError):
@@ -100,7 +111,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole or orthographic camera that looks along its -Z, with +Y up."""
+    """A perspective or orthographic camera that looks along its -Z, with +Y up."""
 
     name: str = ""
     world_from_camera: Floats = field(default_factory=lambda: np.eye(4))
@@ -112,6 +123,10 @@ class Camera:
     """Nearest and farthest depth along -Z that camera rays see, in scene units."""
     exposure: float = 1.0
     """Linear factor on the film's radiance (UsdGeomCamera's exposure controls; 1 by default)."""
+    lens_radius: float = 0.0
+    """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
+    focus_distance: float = 1.0
+    """Depth along -Z at which a camera with a lens is sharp, in scene units."""
 
     @property
     def aspect(self) -> float:
@@ -119,12 +134,28 @@ class Camera:
         left, right, bottom, top = self.window
         return (right - left) / (top - bottom)
 
-    def fit(self, width: int, height: int) -> "Camera":
-        """This camera with its window grown to the aspect of an image (USD's `expandAperture`)."""
+    def fit(self, width: int, height: int, policy: str = CONFORM_POLICIES[0], pixel_aspect: float = 1.0) -> "Camera":
+        """This camera with its window made to fit an image, about its middle.
+
+        Args:
+            width: Of the image, in pixels.
+            height: Of the image.
+            policy: One of `CONFORM_POLICIES`: the window grows (expandAperture), shrinks (cropAperture), changes in
+                one of its sides alone (adjustApertureWidth, adjustApertureHeight), or stays as it is and the pixels
+                are stretched over it (adjustPixelAspectRatio).
+            pixel_aspect: Width of a pixel over its height.
+        """
         left, right, bottom, top = self.window
-        grow = (width / height) / self.aspect
-        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * max(grow, 1.0)
-        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * max(1.0 / grow, 1.0)
+        grow = width / height * pixel_aspect / self.aspect  # 1: it fits already
+        wider, taller = {
+            "expandAperture": (max(grow, 1.0), max(1.0 / grow, 1.0)),
+            "cropAperture": (min(grow, 1.0), min(1.0 / grow, 1.0)),
+            "adjustApertureWidth": (grow, 1.0),
+            "adjustApertureHeight": (1.0, 1.0 / grow),
+            "adjustPixelAspectRatio": (1.0, 1.0),
+        }[policy]
+        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * wider
+        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * taller
         return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
 
     @staticmethod
@@ -174,6 +205,12 @@ class Scene:
     """What was skipped, approximated or guessed: one line each, beginning with the prim's path."""
     stats: Mapping[str, int] = field(default_factory=dict)
     """Counts of what was read and what was skipped, for `--stats` and `warp-ir info`."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of `RenderSettings` that the file asks for; `render` without settings of yours does so."""
+    shutter: tuple["Scene", ...] = ()
+    """The scene at moments spread evenly over the time in which the camera's shutter is open, in order, a power of two
+    of them; empty: nothing moves. Iterations take them in turn. What does not move are the same objects in all of them.
+    """
 
     @property
     def triangle_count(self) -> int:
@@ -183,10 +220,10 @@ class Scene:
     def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper corner of the meshes' bounding box, float64 [3]; a unit cube if there are none."""
         # Only points that a triangle uses count: stray points must not move the scene's frame.
-        used = [mesh.points[np.unique(mesh.triangles)] for mesh in self.meshes if len(mesh.triangles)]
-        if not used:
+        boxes = [_box(mesh) for mesh in self.meshes if len(mesh.triangles)]
+        if not boxes:
             return np.full(3, -0.5), np.full(3, 0.5)
-        return np.min([p.min(axis=0) for p in used], axis=0), np.max([p.max(axis=0) for p in used], axis=0)
+        return np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
 
     @property
     def extent(self) -> float:
@@ -206,11 +243,26 @@ class Scene:
             area = _areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
             total += float(area.sum())
-            reflected += float(area @ rho)
+            reflected += float((area * rho).sum())
         return reflected / total if total > 0.0 else 0.0
+
+
+# A mesh that does not move is part of many scenes: what is computed of it is kept as long as it lives.
+_AREAS: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
+_BOXES: WeakKeyDictionary[Mesh, tuple[Floats, Floats]] = WeakKeyDictionary()
 
 
 def _areas(mesh: Mesh) -> Floats:
     """Areas of a mesh's triangles, float64 [m]."""
-    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if mesh not in _AREAS:
+        a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+        _AREAS[mesh] = np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return _AREAS[mesh]
+
+
+def _box(mesh: Mesh) -> tuple[Floats, Floats]:
+    """Lower and upper corner [3] of the points that the triangles use."""
+    if mesh not in _BOXES:
+        used = mesh.points[np.unique(mesh.triangles)]
+        _BOXES[mesh] = (used.min(axis=0), used.max(axis=0))
+    return _BOXES[mesh]

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from warp_ir.scene import InputError
+from warp_ir.scene import CONFORM_POLICIES, InputError
 
 ESTIMATOR_NAMES = ("vpl", "keller", "path")
 """In the order in which help texts list them; the first is the default."""
@@ -25,6 +25,17 @@ class RenderSettings:
 
     width: int = _setting(512, "width of the picture in pixels")
     height: int | None = _setting(None, "height in pixels; by default from the camera's aspect")
+    pixel_aspect: float = _setting(1.0, "width of a pixel over its height")
+    conform: str = _setting(
+        CONFORM_POLICIES[0], "what happens to the camera's window if its aspect is not the picture's", CONFORM_POLICIES
+    )
+    data_window: tuple[float, float, float, float] = _setting(
+        (0.0, 0.0, 1.0, 1.0),
+        "part of the picture to render: left, bottom, right and top, where 0 0 1 1 is all of it; only pixels whose"
+        " centre lies inside, and an .exr tells where they belong",
+    )
+    depth_of_field: bool = _setting(True, "blur what is out of the camera's focus, if it has an f-stop")
+    motion_blur: bool = _setting(True, "blur what moves while the camera's shutter is open")
     iterations: int | None = _setting(None, "stop after this many iterations (64 if no other limit is given)")
     time_limit: float | None = _setting(None, "stop after this many seconds of rendering")
     target_error: float | None = _setting(
@@ -63,11 +74,28 @@ class RenderSettings:
         for name in ("time_limit", "target_error"):
             self._check(name, getattr(self, name) is None or _positive(getattr(self, name)), "a positive number")
         self._check("bound_radius", self.bound_radius == 0 or _positive(self.bound_radius), "a number of at least 0")
+        self._check("pixel_aspect", _positive(self.pixel_aspect), "a positive number")
+        self._check("conform", self.conform in CONFORM_POLICIES, f"one of {', '.join(CONFORM_POLICIES)}")
+        self._check_data_window()
         self._check("estimator", self.estimator in ESTIMATOR_NAMES, f"one of {', '.join(ESTIMATOR_NAMES)}")
         self._check("absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}")
         self._check(
             "width", self.width * (self.height or 1) <= MAX_PIXELS, f"small enough: at most {MAX_PIXELS} pixels in all"
         )
+
+    def pixels(self) -> tuple[int, int, int, int]:
+        """Left column, top row, columns and rows of the data window; the height must be set.
+
+        It may reach beyond the picture: the first two can be negative.
+        """
+        assert self.height is not None
+        left, bottom, right, top = self.data_window
+        # Half-open, so that windows that tile the picture share no pixel.
+        x0, x1 = (math.ceil(x * self.width - 0.5) for x in (left, right))
+        y0, y1 = (math.ceil((1.0 - y) * self.height - 0.5) for y in (top, bottom))
+        self._check("data_window", x1 > x0 and y1 > y0, "large enough to hold a pixel")
+        self._check("data_window", (x1 - x0) * (y1 - y0) <= MAX_PIXELS, f"of at most {MAX_PIXELS} pixels")
+        return x0, y0, x1 - x0, y1 - y0
 
     @property
     def iteration_limit(self) -> float:
@@ -89,6 +117,13 @@ class RenderSettings:
     def _check(self, name: str, good: bool, wanted: str) -> None:
         if not good:
             raise InputError(f"{name}: must be {wanted}, is {getattr(self, name)!r}")
+
+    def _check_data_window(self) -> None:
+        window = self.data_window
+        numbers = isinstance(window, tuple | list) and len(window) == 4
+        numbers = numbers and all(isinstance(x, int | float) and abs(x) < 1.0e4 for x in window)
+        good = numbers and window[0] < window[2] and window[1] < window[3]
+        self._check("data_window", good, "left, bottom, right, top with left < right and bottom < top")
 
     def _check_integer(self, name: str, least: int, most: int = 2**31 - 1, *, optional: bool = False) -> None:
         value = getattr(self, name)

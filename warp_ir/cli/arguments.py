@@ -8,7 +8,7 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 from warp_ir import __version__
@@ -18,9 +18,19 @@ from warp_ir.settings import RenderSettings
 from warp_ir.tonemap import TONEMAPS
 
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
-_ONLY_PICTURES = {"iterations", "time_limit", "target_error", "visible_lights", "bound_radius"}
+_ONLY_PICTURES = {
+    *("iterations", "time_limit", "target_error", "visible_lights", "bound_radius"),
+    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur"),
+}
 """Settings that the light paths alone do not depend on."""
 _SHORT = {"width": ("-w",)}
+_OUTPUT = (
+    "picture to write; ### stands for the frame. Or a folder, for all the pictures that the stage's RenderProducts name"
+)
+_LONG_CHOICE = 40
+"""Characters beyond which the choices of a setting do not stand in for its value, but in the text beside it."""
+LISTS = ("cameras", "lights", "materials", "settings")
+"""What `warp-ir info --list` can list."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
@@ -35,8 +45,13 @@ examples:
   warp-ir render room.usda room.exr --target-error 0.01 --aov depth normal
   # another camera, half a minute, three times as bright as the file says
   warp-ir render room.usda room.png --camera Door --time-limit 30 --exposure 1.5
-  # an animation
+  # an animation; the same again after a crash, with --resume
   warp-ir render shot.usd shots/####.png --frames 1001:1024 --make-output-path
+  # all pictures that the stage's RenderSettings ask for
+  warp-ir render shot.usd renders/ --make-output-path
+  # in red paint, with a lamp switched off in a layer
+  warp-ir render car.usd car.png --variant '/Car{paint=red}' \\
+      --session-layer no_lamp.usda
   # a second opinion: the same picture by path tracing
   warp-ir render room.usda path.png --estimator path --iterations 256
 """
@@ -105,27 +120,52 @@ def _joined_names(argv: Sequence[str]) -> list[str]:
     return joined
 
 
-def settings_of(args: argparse.Namespace) -> RenderSettings:
-    """The render settings that were given; the others have their defaults.
+def given_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """The fields of `RenderSettings` that were given."""
+    given: dict[str, Any] = {name: value for name, value in vars(args).items() if name in _FIELDS}
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    if getattr(args, "res", None):
+        given["width"], given["height"] = args.res
+    return given
+
+
+def settings_of(args: argparse.Namespace, stage: Mapping[str, Any] | None = None) -> RenderSettings:
+    """The render settings: as given, else as the stage asks, else the defaults.
+
+    Args:
+        args: The command line.
+        stage: Fields of `RenderSettings` that the stage asks for.
 
     Raises:
         InputError: A value is out of range; the message names the flag.
     """
-    given = {name: value for name, value in vars(args).items() if name in _FIELDS}
+    given, wanted = given_settings(args), dict(stage or {})
+    if ("width" in given) != ("height" in given) and "width" in wanted:
+        # One side alone: the other follows the shape of the stage's resolution.
+        side, other = ("width", "height") if "width" in given else ("height", "width")
+        if isinstance(given[side], int) and given[side] > 0:
+            wanted[other] = max(1, round(given[side] * wanted[other] / wanted[side]))
+    if {"iterations", "time_limit", "target_error"} & set(given):
+        wanted = {k: v for k, v in wanted.items() if k not in ("iterations", "time_limit", "target_error")}
     try:
-        return RenderSettings(**given)
+        return RenderSettings(**{**wanted, **given})
     except InputError as error:
         name, colon, rest = str(error).partition(":")
         raise InputError(f"{_flag(name)}{colon}{rest}" if name in _FIELDS else str(error)) from error
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("output", metavar="OUTPUT", help="picture to write; ### stands for the frame")
+    parser.add_argument("output", metavar="OUTPUT", help=_OUTPUT)
     picture = parser.add_argument_group("picture")
     _add_settings(picture, _FIELDS)
-    # usdrecord's name, understood and not advertised.
+    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height in one")
+    # usdrecord's names, understood and not advertised.
     hidden = argparse.SUPPRESS
+    unsaid: dict[str, Any] = {"default": hidden, "help": hidden}
     picture.add_argument("--imageWidth", dest="width", type=int, default=hidden, help=hidden)
+    picture.add_argument("--enableDomeLightVisibility", dest="visible_lights", action="store_true", **unsaid)
+    picture.add_argument("--disableCameraLight", dest="default_light", action="store_const", const="none", **unsaid)
+    picture.add_argument("--disableGpu", dest="device", action="store_const", const="cpu", **unsaid)
     _add_stage(parser)
     output = parser.add_argument_group("output")
     output.add_argument(
@@ -147,6 +187,10 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     )
     output.add_argument("--float", dest="half", action="store_false", help="store .exr with 32 bits, not 16")
     output.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
+    resume = "keep the pictures that are there, and go on with the one that an earlier command has begun"
+    output.add_argument("--resume", action="store_true", help=resume)
+    checkpoint = "how often OUTPUT.film.npz is written for --resume, until OUTPUT is done (default: 60; 0: never)"
+    output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory and versions")
     _add_device(output)
 
@@ -154,6 +198,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
 def _add_info(parser: argparse.ArgumentParser) -> None:
     _add_stage(parser, frames=False)
     parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--list", choices=LISTS, metavar="WHAT", help=f"only this, a line each: {', '.join(LISTS)}")
 
 
 def _add_vpls(parser: argparse.ArgumentParser) -> None:
@@ -182,14 +227,22 @@ def _add_settings(group: Any, names: Collection[str]) -> None:
             options["action"] = argparse.BooleanOptionalAction if field.default else "store_true"
         elif field.metadata.get("choices"):
             options["choices"] = field.metadata["choices"]
+            if len(",".join(options["choices"])) > _LONG_CHOICE:
+                doc += f": {', '.join(options['choices'])}"
+                options["metavar"] = "NAME"
+        elif isinstance(field.default, tuple):
+            options |= {"type": float, "nargs": len(field.default), "metavar": "X"}
         else:
             options |= {"type": kind, "metavar": {int: "N", float: "X"}.get(kind, "TEXT")}
-        if field.default is not None and kind is not bool:
+        if isinstance(field.default, tuple):
+            doc += f" (default: {' '.join(f'{x:g}' for x in field.default)})"
+        elif field.default is not None and kind is not bool:
             doc += f" (default: {field.default:g})" if kind is float else f" (default: {field.default})"
         group.add_argument(_flag(name), *_SHORT.get(name, ()), help=doc, **options)
 
 
 def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
+    hidden = argparse.SUPPRESS  # usdrecord's names, understood and not advertised
     group = parser.add_argument_group("stage")
     group.add_argument("--camera", "-cam", metavar="NAME", help="path or name (default: the main camera)")
     when = group.add_mutually_exclusive_group()
@@ -197,12 +250,17 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         spec = "101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"
         when.add_argument("--frames", "-f", metavar="SPEC", help=spec)
     when.add_argument("--time", type=_finite, metavar="CODE", help="time code (default: the stage's start)")
+    when.add_argument("--default-time", "-d", action="store_true", help="the default time, at which nothing moves")
+    when.add_argument("--defaultTime", dest="default_time", action="store_true", help=hidden)
+    wanted = "RenderSettings to honour (default: those the stage names, or its first)"
+    group.add_argument("--render-settings", "-rs", metavar="PRIM", help=wanted)
+    group.add_argument("--renderSettingsPrimPath", dest="render_settings", help=hidden)
     group.add_argument(
         "--purposes",
         type=_names(_PURPOSES),
-        default=["render"],
         metavar="NAME[,NAME]",
-        help="what to draw beside purpose 'default': render, proxy, guide (default: render)",
+        help="what to draw beside purpose 'default': render, proxy, guide (default: what the RenderSettings"
+        " say, or render)",
     )
     group.add_argument(
         "--complexity",
@@ -211,6 +269,23 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         default="low",
         help="of subdivision surfaces: their cages, or one, two, three levels of refinement (default: low)",
     )
+    group.add_argument(
+        "--mask",
+        type=_paths,
+        default=[],
+        metavar="PRIM[,PRIM]",
+        help="load only these prims, and what is above, below and related to them; lights are not by themselves",
+    )
+    group.add_argument(
+        "--variant",
+        dest="variants",
+        action="append",
+        default=[],
+        metavar="/PRIM{SET=NAME}",
+        help="select a variant; may be given several times",
+    )
+    group.add_argument("--session-layer", metavar="FILE", help="USD file that is stronger than the stage")
+    group.add_argument("--sessionLayer", dest="session_layer", help=hidden)
     group.add_argument(
         "--default-light",
         choices=("none", "dome"),
@@ -242,6 +317,10 @@ def _names(known: Collection[str]) -> Any:
     return names
 
 
+def _paths(text: str) -> list[str]:
+    return text.replace(",", " ").split()
+
+
 def _finite(text: str) -> float:
     try:
         value = float(text)
@@ -249,6 +328,13 @@ def _finite(text: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"not a number: {text!r}")
+    return value
+
+
+def _seconds(text: str) -> float:
+    value = _finite(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError("must be at least 0")
     return value
 
 

@@ -5,10 +5,12 @@ from pathlib import Path
 
 from warp_ir.scene import InputError
 
+Moment = float | str | None
+"""A time code; "default" for the default time, None for the stage's start."""
 _MAX_FRAMES = 1_000_000
 
 
-def outputs_of(output: str, frames: str | None, time: float | None) -> dict[float | None, Path]:
+def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Path]:
     """Time code -> the file to write; the one key is `time` if no frames are asked for.
 
     Args:
@@ -21,19 +23,20 @@ def outputs_of(output: str, frames: str | None, time: float | None) -> dict[floa
     """
     if frames is None:
         return {time: Path(output)}
+    codes = time_codes(frames)
     placeholders = re.findall(r"#+(?:\.#+)?", output)
     if len(placeholders) != 1:
         raise InputError(f"--frames: the output needs one placeholder such as ### for the frame: {output}")
     width, digits = len(placeholders[0]), len(placeholders[0].partition(".")[2])
-    outputs: dict[float | None, Path] = {}
-    for frame in _time_codes(frames):
+    outputs: dict[Moment, Path] = {}
+    for frame in codes:
         if round(frame, digits) != frame:
             raise InputError(f"--frames: {frame:g} needs a placeholder with decimals, ###.##: {output}")
         outputs[frame] = Path(output.replace(placeholders[0], f"{frame:0{width}.{digits}f}"))
     return outputs
 
 
-def _time_codes(spec: str) -> list[float]:
+def time_codes(spec: str) -> list[float]:
     """The numbers of a frame specification, without repetitions."""
     from pxr import Tf, UsdUtils
 

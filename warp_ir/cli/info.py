@@ -3,23 +3,31 @@
 import argparse
 import json
 import math
+import time
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from warp_ir.cli.console import say_warnings
-from warp_ir.cli.stage import load_scene, stage_facts
+from warp_ir.cli.stage import moment_of, open_reader, stage_facts
 from warp_ir.scene import LightKind, Scene
 
+_BYTES_PER_TRIANGLE = 200
+"""On the device, beside textures; `benchmarks/scaling.py` measures it."""
 _LINES = 20
 """Lights, materials, ... listed by name before only their number is told; --verbose lists all."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the table, or JSON; the exit code."""
-    scene = load_scene(args, args.time)
-    facts = describe(scene, args.stage)
+    begin = time.perf_counter()
+    reader = open_reader(args)
+    scene = reader.read(moment_of(args))
+    facts = describe(scene, reader, time.perf_counter() - begin)
+    if args.list:
+        _print_list(facts, args.list)
+        return 0
     if args.json:
         print(json.dumps({**facts, "warnings": list(scene.warnings)}, indent=2))
         return 0
@@ -29,19 +37,27 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def describe(scene: Scene, path: str) -> dict[str, Any]:
-    """The scene in plain values, with what only the stage itself knows."""
+def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
+    """The scene in plain values, with what only the stage itself knows, and the seconds it took to load."""
     lower, upper = scene.bounds()
+    camera = scene.camera
     return {
-        "stage": str(path),
-        **stage_facts(path),
+        "stage": str(reader.source),
+        **stage_facts(reader),
         "camera": {
             "name": scene.camera.name,
             "projection": scene.camera.projection.name.lower(),
             "aspect": scene.camera.aspect,
             "position": _floats(scene.camera.world_from_camera[:3, 3]),
             "window": _floats(scene.camera.window),
+            "clipping": [camera.clipping[0], camera.clipping[1] if math.isfinite(camera.clipping[1]) else None],
+            "exposure": camera.exposure,
+            "lens_radius": camera.lens_radius,
+            "focus_distance": camera.focus_distance if camera.lens_radius > 0.0 else None,
+            "shutter_moments": len(scene.shutter),
         },
+        "moving_meshes": reader.moving_meshes,
+        "cost": {"load_seconds": seconds, "scene_bytes": _BYTES_PER_TRIANGLE * scene.triangle_count},
         "meshes": len(scene.meshes),
         "triangles": scene.triangle_count,
         "bounds": [_floats(lower), _floats(upper)],
@@ -69,14 +85,7 @@ def _emissive_triangles(scene: Scene) -> int:
 def _print_table(facts: dict[str, Any], most: float) -> None:
     """One fact a line, the names aligned."""
     camera, (lower, upper) = facts["camera"], facts["bounds"]
-    lights = [
-        f"{light['kind']:9} {_EMITS[light['kind']]} ({_numbers(light['radiance'])})  {light['name']}"
-        for light in facts["lights"]
-    ]
-    materials = [
-        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}  {m['name'] or '(default)'}"
-        for m in facts["materials"]
-    ]
+    cost = facts["cost"]
     _row("stage", facts["stage"])
     _row("up axis", f"{facts['up_axis']}, {facts['meters_per_unit']:g} m per unit")
     if facts["frames"]:
@@ -86,12 +95,71 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
         f"{camera['name'] or '(around it all)'}, {camera['projection']}, aspect {camera['aspect']:.4g}",
     )
     _list("other cameras", [name for name in facts["cameras"] if name != camera["name"]], most)
-    _row("meshes", facts["meshes"])
+    if camera["lens_radius"] > 0.0:
+        _row("lens", f"radius {camera['lens_radius']:.4g}, in focus at {camera['focus_distance']:.4g}")
+    if camera["shutter_moments"]:
+        _row("motion blur", f"of {camera['shutter_moments']} moments")
+    if camera["exposure"] != 1.0:
+        _row("exposure", f"{camera['exposure']:.4g} times the radiance")
+    _list("settings", _settings_lines(facts), most)
+    moving = f", {facts['moving_meshes']} of them move or change" if facts["moving_meshes"] else ""
+    _row("meshes", f"{facts['meshes']}{moving}")
     _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit")
     _row("bounds", f"({_numbers(lower)}) to ({_numbers(upper)})")
-    _list("lights", lights, most)
-    _list("materials", materials, most)
+    _list("lights", _light_lines(facts), most)
+    _list("materials", _material_lines(facts), most)
+    _row("costs", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory to render")
     _list("counts", [f"{value:9} {key.replace('_', ' ')}" for key, value in facts["counts"].items()], math.inf)
+
+
+def _print_list(facts: dict[str, Any], what: str) -> None:
+    """One thing a line, nothing else."""
+    lines = {
+        "cameras": facts["cameras"],
+        "lights": _light_lines(facts),
+        "materials": _material_lines(facts),
+        "settings": _settings_lines(facts),
+    }
+    for line in lines[what]:
+        print(line)
+
+
+def _light_lines(facts: dict[str, Any]) -> list[str]:
+    return [
+        f"{light['kind']:9} {_EMITS[light['kind']]} ({_numbers(light['radiance'])})  {light['name']}"
+        for light in facts["lights"]
+    ]
+
+
+def _material_lines(facts: dict[str, Any]) -> list[str]:
+    return [
+        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}  {m['name'] or '(default)'}"
+        for m in facts["materials"]
+    ]
+
+
+def _settings_lines(facts: dict[str, Any]) -> list[str]:
+    """The render settings that are used, with what their products ask for; then those that are not."""
+    found = facts["render_settings"]
+    lines = []
+    for product in found["products"]:
+        wants = ", ".join(f"{name} {_plain(value)}" for name, value in product["settings"].items())
+        aovs = f", variables {' '.join(product['aovs'])}" if product["aovs"] else ""
+        name = f"{product['name']}  " if product["name"] else ""
+        lines.append(f"{name}{product['path'] or found['used']}: {wants}{aovs}")
+    return lines + [f"{path}: not used" for path in found["all"] if path != found["used"]]
+
+
+def _plain(value: Any) -> str:
+    return _numbers(list(value)) if isinstance(value, tuple) else str(value)
+
+
+def _bytes(count: float) -> str:
+    for unit in ("bytes", "KiB", "MiB"):
+        if count < 1024.0:
+            return f"{count:.3g} {unit}"
+        count /= 1024.0
+    return f"{count:.3g} GiB"
 
 
 _EMITS = {kind.name.lower(): "radiance" for kind in LightKind} | {"point": "intensity"}

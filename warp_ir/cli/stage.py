@@ -3,42 +3,67 @@
 import argparse
 from typing import Any
 
-import warp_ir as ir
-from warp_ir.scene import Scene
 
-
-def load_scene(args: argparse.Namespace, time: float | None) -> Scene:
-    """The scene at a time code, as the flags of the group "stage" want it.
+def open_reader(args: argparse.Namespace) -> Any:
+    """The `StageReader` that the flags of the group "stage" want.
 
     Raises:
-        InputError: It cannot be loaded.
+        InputError: The stage cannot be opened.
     """
-    scene: Scene = ir.load_usd(
+    from warp_ir.usd.load import StageReader
+
+    return StageReader(
         args.stage,
         camera=args.camera,
-        time=time,
-        purposes=tuple(dict.fromkeys(("default", *args.purposes))),
+        purposes=None if args.purposes is None else tuple(dict.fromkeys(("default", *args.purposes))),
         complexity=args.complexity,
         default_light=args.default_light,
         strict=args.strict,
+        render_settings=args.render_settings,
+        mask=args.mask,
+        variants=args.variants,
+        session_layer=args.session_layer,
+        motion_blur=getattr(args, "motion_blur", args.command != "vpls"),
     )
-    return scene
 
 
-def stage_facts(path: str) -> dict[str, Any]:
-    """Axis, unit, frames and cameras: what a renderer does not need to know, and a user might."""
+def moment_of(args: argparse.Namespace) -> float | str | None:
+    """The moment that the flags want, of a single picture."""
+    return "default" if args.default_time else args.time
+
+
+def stage_facts(reader: Any) -> dict[str, Any]:
+    """Axis, unit, frames, cameras and settings: what a renderer does not need to know, and a user might."""
     from pxr import UsdGeom
 
+    from warp_ir.usd.camera import all_cameras
+    from warp_ir.usd.render_spec import render_settings_prims
     from warp_ir.usd.report import Report
-    from warp_ir.usd.stage import open_stage, quiet, up_axis
+    from warp_ir.usd.stage import quiet, up_axis
 
-    report = Report(path)  # what it says, `load_scene` has said
+    stage = reader.stage
     with quiet():
-        stage = open_stage(path, report)
+        spec = reader.spec()
         frames = [stage.GetStartTimeCode(), stage.GetEndTimeCode()] if stage.HasAuthoredTimeCodeRange() else None
         return {
-            "up_axis": up_axis(stage, report),
+            "up_axis": up_axis(stage, Report(reader.source)),  # what it says, the reader has said
             "meters_per_unit": float(UsdGeom.GetStageMetersPerUnit(stage)),
             "frames": frames,
-            "cameras": [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)],
+            "cameras": [str(prim.GetPath()) for prim in all_cameras(stage)],
+            "render_settings": {
+                "used": spec.path,
+                "all": [str(prim.GetPath()) for prim in render_settings_prims(stage)],
+                "purposes": None if spec.purposes is None else list(spec.purposes),
+                "products": [
+                    {
+                        "path": product.path,
+                        "name": product.name,
+                        "camera": product.camera,
+                        "settings": dict(product.settings),
+                        "aovs": list(product.aovs),
+                    }
+                    for product in spec.products
+                    if spec.path
+                ],
+            },
         }

@@ -11,7 +11,7 @@ import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.console import muted_stderr, say, say_warnings
 from warp_ir.cli.device import open_device
-from warp_ir.cli.stage import load_scene, stage_facts
+from warp_ir.cli.stage import moment_of, open_reader, stage_facts
 from warp_ir.image import check_output, whole_file
 from warp_ir.scene import InputError, Scene
 
@@ -23,7 +23,8 @@ def run(args: argparse.Namespace) -> int:
     settings = settings_of(args)
     path = check_output(args.output, (".png", ".usda", ".npz"), make_folder=args.make_output_path)
     device = open_device(args.device, verbose=args.verbose)
-    scene = load_scene(args, args.time)
+    reader = open_reader(args)
+    scene = reader.read(moment_of(args))
     if not args.quiet:
         say_warnings(scene.warnings, everything=args.verbose)
     vpls = ir.trace_vpls(scene, settings, device=device, iteration=args.iteration)
@@ -31,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     if suffix == ".npz":
         _write_arrays(path, vpls)
     elif suffix == ".usda":
-        write_points(path, scene, vpls, stage_facts(args.stage))
+        write_points(path, scene, vpls, stage_facts(reader))
     else:
         from warp_ir.preview import picture_vpls
 

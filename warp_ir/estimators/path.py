@@ -13,8 +13,8 @@ from typing import Any
 import warp as wp
 
 from warp_ir import sampling
-from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.device_scene import CameraData, DeviceScene, SceneData
+from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
 from warp_ir.launch import Launcher
 from warp_ir.lights import LightPoint, lights_along, sample_light, surface_weight
 from warp_ir.settings import RenderSettings
@@ -54,6 +54,7 @@ def _light_at(
 def _trace_paths(
     first: int,
     scene: SceneData,
+    camera: CameraData,
     gbuffer: GBuffer,
     scramble: wp.uint32,
     max_bounces: int,
@@ -65,7 +66,7 @@ def _trace_paths(
     once = wp.vec3(0.0)
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
-        stream = sampling.hash_combine(scramble, wp.uint32(pixel))
+        stream = sampling.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
         position = gbuffer.position[pixel]
         normal = gbuffer.normal[pixel]
         shading_normal = gbuffer.shading_normal[pixel]
@@ -130,6 +131,7 @@ class PathTracer:
                 gbuffer.mesh.shape[0],
                 [
                     self._scene.data,
+                    self._camera,
                     gbuffer,
                     wp.uint32(sampling.iteration_scramble(settings.seed, iteration)),
                     _UNLIMITED if settings.max_bounces is None else settings.max_bounces,

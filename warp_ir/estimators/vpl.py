@@ -41,7 +41,9 @@ _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the lig
 class GatherSettings:
     """What the gathering kernel needs to know beside the scene."""
 
-    columns: int  # pixels per row
+    columns: int  # of the film
+    first_column: int  # of the film in the image, as for `CameraData`
+    first_row: int
     scramble: wp.uint32
     rays: wp.vec2i  # to lights and to surfaces
     rays_after: wp.vec2i  # where a compensation ray ends
@@ -74,7 +76,9 @@ def _gather_pixels(
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         # Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels.
-        index = _spread(pixel % settings.columns) | (_spread(pixel // settings.columns) << 1)
+        column = (settings.first_column + pixel % settings.columns) & 0xFFFF
+        row = (settings.first_row + pixel // settings.columns) & 0xFFFF
+        index = _spread(column) | (_spread(row) << 1)
         # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
         order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
         chosen_set = (index ^ int(order)) & 63  # of as many sets as there are
@@ -157,6 +161,7 @@ class VplGatherer:
             lights, surfaces = arrange(vpls, self._scene, launcher)
         how = GatherSettings()
         how.columns = self._camera.columns
+        how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
         how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
         how.max_bounces = _UNLIMITED if settings.max_bounces is None else settings.max_bounces

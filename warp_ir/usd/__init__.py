@@ -4,6 +4,6 @@ Reading order: `load` (the whole on one page), `walk` (what is drawn, and where)
 `material` and `surface` (what they look like), `light`, `camera`. Whatever cannot be honoured goes to `report`.
 """
 
-from warp_ir.usd.load import load_usd
+from warp_ir.usd.load import StageReader, load_usd
 
-__all__ = ["load_usd"]
+__all__ = ["StageReader", "load_usd"]

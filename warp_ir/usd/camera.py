@@ -1,10 +1,9 @@
 """Cameras: which one is meant, what it sees, and one that frames the scene where there is none."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, UsdRender, UsdUtils
+from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
 from warp_ir.scene import Camera, Floats, InputError, Projection
 from warp_ir.usd import value
@@ -14,12 +13,13 @@ _TENTH = 0.1
 """Apertures and focal lengths are in tenths of a scene unit."""
 
 
-def find_camera(stage: Usd.Stage, name: str | None, report: Report) -> Usd.Prim | None:
+def find_camera(stage: Usd.Stage, name: str | None, wanted: str, report: Report) -> Usd.Prim | None:
     """The camera to render: named, else of the render settings, else the primary one, else the first.
 
     Args:
         stage: The stage.
         name: Absolute path, or name of a camera prim; None to choose.
+        wanted: Path of the camera that the render settings name; "" if there is none.
         report: Where a guess is reported.
 
     Returns:
@@ -28,22 +28,41 @@ def find_camera(stage: Usd.Stage, name: str | None, report: Report) -> Usd.Prim 
     Raises:
         InputError: There is no camera of that name.
     """
-    predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-    cameras = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), predicate) if prim.IsA(UsdGeom.Camera)]
+    cameras = all_cameras(stage)
     if name is not None:
         for prim in cameras:
             if name in (str(prim.GetPath()), prim.GetName()):
                 return prim
         available = ", ".join(str(prim.GetPath()) for prim in cameras) or "none"
         raise InputError(f"{report.source}: no camera '{name}'; available: {available}")
-    by_settings = _camera_of_settings(stage, report)
-    if by_settings is not None:
-        return by_settings
+    if wanted:
+        return stage.GetPrimAtPath(wanted)
     primary = UsdUtils.GetPrimaryCameraName()
     chosen = next((prim for prim in cameras if prim.GetName() == primary), cameras[0] if cameras else None)
     if chosen is not None and len(cameras) > 1 and chosen.GetName() != primary:
         report.warn(chosen.GetPath(), f"rendered because it is the first of {len(cameras)} cameras")
     return chosen
+
+
+def all_cameras(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Every camera, in instances too."""
+    predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+    return [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), predicate) if prim.IsA(UsdGeom.Camera)]
+
+
+def read_shutter(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[float, float]:
+    """When a camera's shutter opens and closes [time codes after the frame]; the same if it is not open at all."""
+    camera = UsdGeom.Camera(prim)
+    try:
+        opens = value.number(camera.GetShutterOpenAttr(), time, 0.0)
+        closes = value.number(camera.GetShutterCloseAttr(), time, 0.0)
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{trouble}; no motion blur")
+        return 0.0, 0.0
+    if closes < opens:
+        report.warn(prim.GetPath(), f"its shutter closes at {closes:g}, before it opens: no motion blur")
+        return 0.0, 0.0
+    return opens, closes
 
 
 def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
@@ -78,10 +97,16 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
     half_y = 0.5 * positive(camera.GetVerticalApertureAttr(), 15.2908)
     x = optional(camera.GetHorizontalApertureOffsetAttr(), 0.0)
     y = optional(camera.GetVerticalApertureOffsetAttr(), 0.0)
-    if optional(camera.GetFStopAttr(), 0.0) > 0.0:
-        report.warn(prim.GetPath(), "depth of field is not rendered")
-    if optional(camera.GetShutterCloseAttr(), 0.0) > optional(camera.GetShutterOpenAttr(), 0.0):
-        report.warn(prim.GetPath(), "motion blur is not rendered")
+    lens, focus = 0.0, optional(camera.GetFocusDistanceAttr(), 0.0)
+    stop = optional(camera.GetFStopAttr(), 0.0)
+    if stop > 0.0 and projection == Projection.ORTHOGRAPHIC:
+        report.warn(prim.GetPath(), "fStop: an orthographic camera has no depth of field")
+    elif stop > 0.0 and focus <= 0.0:
+        report.warn(prim.GetPath(), f"focusDistance is {focus:g}: no depth of field")
+    elif stop > 0.0:
+        lens = 0.5 * _TENTH / (unit * stop)
+    if isinstance(planes := value.raw(camera.GetClippingPlanesAttr(), time), Vt.Vec4fArray) and len(planes):
+        report.warn(prim.GetPath(), "clippingPlanes: nothing is cut away by planes of its own")
     exposure = _exposure(camera, time)
     if not (math.isfinite(exposure) and exposure >= 0.0):
         report.warn(prim.GetPath(), f"its exposure scale is {exposure:g}; 1 is used")
@@ -93,6 +118,8 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
         projection=projection,
         clipping=_clipping(camera, time, report),
         exposure=exposure,
+        lens_radius=lens,
+        focus_distance=focus if lens > 0.0 else 1.0,
     )
 
 
@@ -116,25 +143,6 @@ def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
         matrix[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     matrix[:3, 3] = 0.5 * (lower + upper) + distance * matrix[:3, 2]
     return Camera("framing camera", matrix, (-half_x, half_x, -half_y, half_y))
-
-
-def _camera_of_settings(stage: Usd.Stage, report: Report) -> Usd.Prim | None:
-    """The camera that the stage's RenderSettings (or their first product) name."""
-    settings = UsdRender.Settings.GetStageRenderSettings(stage)
-    owners: Sequence[Usd.Prim] = [settings.GetPrim()] if settings else []
-    if not owners:
-        owners = [prim for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
-    for owner in owners:
-        products = UsdRender.Settings(owner).GetProductsRel().GetForwardedTargets()
-        for prim in (owner, *map(stage.GetPrimAtPath, products)):
-            if not prim:
-                continue
-            for path in UsdRender.SettingsBase(prim).GetCameraRel().GetForwardedTargets():
-                target = stage.GetPrimAtPath(path)
-                if target and target.IsA(UsdGeom.Camera):
-                    return target
-                report.warn(prim.GetPath(), f"its camera {path} is not a camera of the stage")
-    return None
 
 
 def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:

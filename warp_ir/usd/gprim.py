@@ -20,9 +20,15 @@ from warp_ir.usd.walk import Site
 _MOST_TRIANGLES = 200_000_000
 """A flattened scene of this size takes tens of gigabytes: refused before it is allocated."""
 
+_Shapes = dict[tuple[Sdf.Path, ...], Shape | None]
+
 
 def build_meshes(
-    sites: Sequence[Site], time: Usd.TimeCode, report: Report, levels: int = 0
+    sites: Sequence[Site],
+    time: Usd.TimeCode,
+    report: Report,
+    levels: int = 0,
+    shapes: _Shapes | None = None,
 ) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
     """All meshes in the world, one per gprim with all its copies, and the materials they use.
 
@@ -31,21 +37,22 @@ def build_meshes(
         time: Of the values.
         report: Where troubles go.
         levels: How often subdivision surfaces are refined.
+        shapes: Those that are known already; new ones are added.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    return _Builder(time, report, levels).run(sites)
+    return _Builder(time, report, levels, {} if shapes is None else shapes).run(sites)
 
 
 class _Builder:
     """From gprims to meshes and the materials they use."""
 
-    def __init__(self, time: Usd.TimeCode, report: Report, levels: int) -> None:
+    def __init__(self, time: Usd.TimeCode, report: Report, levels: int, shapes: _Shapes) -> None:
         self._time, self._report, self._levels = time, report, levels
         self._table = MaterialTable(time, report)
         self._skinning = Skinning(time, report)
-        self._shapes: dict[tuple[Sdf.Path, ...], Shape | None] = {}
+        self._shapes = shapes
 
     def run(self, sites: Sequence[Site]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
         self._table.resolve([site.prim for site in sites])

@@ -2,19 +2,23 @@
 
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pxr import Tf, Usd
 
-from warp_ir.scene import InputError, Light, LightKind, Scene
-from warp_ir.usd.camera import find_camera, framing_camera, read_camera
+from warp_ir.scene import InputError, Light, LightKind, Material, Mesh, Scene
+from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
+from warp_ir.usd.motion import Motion
+from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
-from warp_ir.usd.walk import Site, walk
+from warp_ir.usd.walk import Found, Site, walk
 
 _COUNTED = (
     "meshes",
@@ -36,17 +40,23 @@ _COUNTED = (
 _LEVELS = {"low": 0, "medium": 1, "high": 2, "veryhigh": 3}
 """How often `complexity` refines a subdivision surface, as usdrecord's complexities 1.0 to 1.3 do."""
 _PURPOSES = ("default", "render", "proxy", "guide")
+_Geometry = tuple[tuple[Mesh, ...], tuple[Material, ...]]
+_DRAWN = ("default", "render")
+"""The purposes that are drawn if nobody says otherwise."""
+
+
+_DOME = Light("default dome", LightKind.DOME, (1.0, 1.0, 1.0))
+_SLICES = 16
+"""Moments that stand for the time in which the shutter is open."""
+_SLICED_TRIANGLES = 20_000_000
+"""Triangles of all moments together, beyond which there are fewer of them."""
 
 
 def load_usd(
     path: str | os.PathLike[str],
     *,
-    camera: str | None = None,
-    time: float | None = None,
-    purposes: Sequence[str] = ("default", "render"),
-    complexity: str = "low",
-    default_light: str = "dome",
-    strict: bool = False,
+    time: float | str | None = None,
+    **options: Any,
 ) -> Scene:
     """Load a USD file for rendering.
 
@@ -54,69 +64,249 @@ def load_usd(
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        camera: Absolute path or name of the camera; None: the one the render settings name, else "main_cam",
-            else the first, else one that frames the scene.
-        time: Time code; None: the stage's start.
-        purposes: Which of default, render, proxy and guide to draw.
-        complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
-            after one, two and three levels of refinement.
-        default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
-        strict: Whether the first warning is an error.
+        time: Time code; None: the stage's start; "default": the default time, at which nothing is animated.
+        options: As for `StageReader`, which loads many moments of one file.
 
     Raises:
         InputError: The file cannot be opened, the camera does not exist or is unusable, an argument is wrong, or
             the scene is too large.
     """
-    source = os.fspath(path)
-    if isinstance(purposes, str) or not set(purposes) <= set(_PURPOSES):
-        raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
-    if complexity not in _LEVELS:
-        raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
-    if default_light not in ("dome", "none"):
-        raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
-    if time is not None and not math.isfinite(time):
-        raise InputError(f"time: {time} is not a finite number")
-    report = Report(source, strict=strict)
-    # Any number in a file may be NaN or huge; readers look at what they compute, NumPy need not say it first.
-    with quiet(), np.errstate(all="ignore"):
-        stage = open_stage(source, report)
-        try:
-            return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
-        except Tf.ErrorException as error:  # damage that shows only when the value is unpacked
-            raise InputError(f"{source}: cannot be read: {first_message(error)}") from None
+    return StageReader(path, **options).read(time)
 
 
-def _load(
-    stage: Usd.Stage,
-    time: Usd.TimeCode,
-    camera: str | None,
-    purposes: Sequence[str],
-    levels: int,
-    default_light: str,
-    report: Report,
-) -> Scene:
-    chosen = find_camera(stage, camera, report)
-    view = None if chosen is None else read_camera(chosen, time, report)
-    axis = up_axis(stage, report)
-    found = walk(stage, time, purposes, report)
-    meshes, materials = build_meshes(found.shapes, time, report, levels)
-    lights = _lights(found.lights, time, report)
-    if not meshes:
-        hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
-        report.warn("/", f"the stage draws no geometry{hint}")
-    if not lights and not any(max(m.emission) > 0.0 for m in materials) and default_light == "dome":
-        report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
-        lights = (Light("default dome", LightKind.DOME, (1.0, 1.0, 1.0)),)
-    stats = dict.fromkeys(_COUNTED, 0) | report.stats
-    stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
-    stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
-    stats["instances"] = stats["native_instances"] + stats["point_instances"]
-    scene = Scene(meshes, materials, lights, name=report.source)
-    if view is None:
-        along = "-Z" if axis == "Y" else "+Y"
-        report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
-        view = framing_camera(*scene.bounds(), axis)
-    return replace(scene, camera=view, warnings=report.lines(), stats=stats)
+class StageReader:
+    """An open stage, to be read at one moment after another: what does not move is read once.
+
+    Static meshes are the same objects in every `Scene`, so that a `Renderer` need not upload them again.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        camera: str | None = None,
+        purposes: Sequence[str] | None = None,
+        complexity: str = "low",
+        default_light: str = "dome",
+        strict: bool = False,
+        render_settings: str | None = None,
+        mask: Sequence[str] = (),
+        variants: Sequence[str] = (),
+        session_layer: str | os.PathLike[str] | None = None,
+        motion_blur: bool = True,
+    ) -> None:
+        """Opens the stage.
+
+        Args:
+            path: A .usd, .usda, .usdc or .usdz file.
+            camera: Absolute path or name of the camera; None: the one the render settings name, else "main_cam",
+                else the first, else one that frames the scene.
+            purposes: Which of default, render, proxy and guide to draw; None: those of the render settings, else
+                default and render.
+            complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
+                after one, two and three levels of refinement.
+            default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
+            strict: Whether the first warning is an error.
+            render_settings: Path of a RenderSettings prim; None: the one that the stage's metadata name, else the
+                first.
+            mask: Paths of prims: only they, what is above, below and related to them, and camera and render settings
+                that are given by their paths, are loaded; () is all.
+            variants: Selections of variants, `/prim{set=selection}`.
+            session_layer: A USD file that is stronger than the stage.
+            motion_blur: Whether to read what happens while the camera's shutter is open (`Scene.shutter`).
+
+        Raises:
+            InputError: A file cannot be opened, or an argument is wrong.
+        """
+        self.source = os.fspath(path)
+        if purposes is not None and (isinstance(purposes, str) or not set(purposes) <= set(_PURPOSES)):
+            raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
+        if complexity not in _LEVELS:
+            raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
+        if default_light not in ("dome", "none"):
+            raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
+        self._camera, self._purposes, self._default_light = camera, purposes, default_light
+        self._render_settings, self._motion_blur = render_settings, motion_blur
+        self._levels = _LEVELS[complexity]
+        self._opened = Report(self.source, strict=strict)
+        with self._reading():
+            self.stage = open_stage(
+                self.source,
+                self._opened,
+                mask=mask,
+                needed=[path for path in (camera, render_settings) if path and path.startswith("/")],
+                variants=variants,
+                session_layer=None if session_layer is None else os.fspath(session_layer),
+            )
+            self._axis = up_axis(self.stage, self._opened)
+            self._motion = Motion(self.stage)
+        self._still: _Still | None = None
+        self._shapes: dict[Any, Any] = {}
+        self._moved = self._opened.part()
+
+    def spec(self, time: float | str | None = None) -> RenderSpec:
+        """What the stage's render settings ask for.
+
+        Raises:
+            InputError: There are no render settings of the given name.
+        """
+        with self._reading():
+            return read_render_spec(self.stage, self._render_settings, time_code(self.stage, time), self._opened.part())
+
+    def read(self, time: float | str | None = None, product: Product | None = None) -> Scene:
+        """The scene at a moment.
+
+        Args:
+            time: As for `load_usd`.
+            product: Whose camera and settings; None: of the render settings' first.
+
+        Raises:
+            InputError: The camera or the scene cannot be used, or the time is no time.
+        """
+        if not (time is None or time == "default" or (isinstance(time, int | float) and math.isfinite(time))):
+            raise InputError(f"time: {time} is not a finite number")
+        with self._reading():
+            code = time_code(self.stage, time)
+            report = self._opened.part()
+            report.include(self._opened)
+            spec = read_render_spec(self.stage, self._render_settings, code, report)
+            wanted = product or spec.products[0]
+            chosen = find_camera(self.stage, self._camera, wanted.camera, report)
+            scene = replace(self._scene(code, chosen, spec, report), settings=dict(wanted.settings))
+            slices: tuple[Scene, ...] = ()
+            blurs = self._motion_blur and wanted.settings.get("motion_blur", True) and not code.IsDefault()
+            if chosen is not None and blurs:
+                slices = self._slices(scene, code.GetValue(), chosen, spec, report)
+            return replace(scene, warnings=report.lines(), shutter=slices)
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Whatever USD or NumPy says of a damaged file is silence, or one line of error."""
+        # Any number in a file may be NaN or huge; readers look at what they compute, NumPy need not say it first.
+        with quiet(), np.errstate(all="ignore"):
+            try:
+                yield
+            except Tf.ErrorException as error:  # damage that shows only when the value is unpacked
+                raise InputError(f"{self.source}: cannot be read: {first_message(error)}") from None
+
+    @property
+    def moving_meshes(self) -> int:
+        """How many of the gprims that were read last may be others, or elsewhere, at another time."""
+        return 0 if self._still is None else len(self._still.moving.shapes)
+
+    def _slices(
+        self, scene: Scene, time: float, camera: Usd.Prim, spec: RenderSpec, report: Report
+    ) -> tuple[Scene, ...]:
+        """The scene at the middles of equal parts of the time in which the shutter is open."""
+        opens, closes = read_shutter(camera, Usd.TimeCode(time), report)
+        assert self._still is not None
+        deforms = bool(self._still.moving.shapes) or self._motion.rearranges
+        if closes <= opens or not (deforms or self._still.moving.lights or self._motion.moves(camera)):
+            return ()
+        count = _SLICES
+        while deforms and count > 2 and count * scene.triangle_count > _SLICED_TRIANGLES:
+            count //= 2
+        if count < _SLICES:
+            report.warn(camera.GetPath(), f"motion blur of {count} moments, not {_SLICES}: the scene is large")
+        moments = [time + opens + (k + 0.5) / count * (closes - opens) for k in range(count)]
+        unsaid = self._opened.part()
+        return tuple(self._scene(Usd.TimeCode(moment), camera, spec, unsaid) for moment in moments)
+
+    def _scene(self, time: Usd.TimeCode, camera: Usd.Prim | None, spec: RenderSpec, report: Report) -> Scene:
+        """Everything at one moment."""
+        view = None if camera is None else read_camera(camera, time, report)
+        key = (*(self._purposes or spec.purposes or _DRAWN), time.IsDefault())
+        still = self._still
+        if still is None or self._motion.rearranges or key != still.key:
+            still = self._still = self._walk(time, key)
+        meshes, materials = still.geometry
+        lights = still.lights
+        report.include(still.report)
+        if still.moving.shapes or still.moving.lights:
+            moved = self._opened.part()
+            meshes, materials = self._with_moving(still.geometry, still.moving.shapes, time, moved)
+            lights = lights + _lights(still.moving.lights, time, moved)
+            moved.mention(self._moved)  # a shape that is known already does not tell again what it lacks
+            report.include(moved)
+            self._moved = moved
+        if not meshes:
+            hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
+            report.warn("/", f"the stage draws no geometry{hint}")
+        if not lights and not any(max(m.emission) > 0.0 for m in materials) and self._default_light == "dome":
+            report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
+            lights = (_DOME,)
+        stats = dict.fromkeys(_COUNTED, 0) | report.stats
+        stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
+        stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
+        stats["instances"] = stats["native_instances"] + stats["point_instances"]
+        scene = Scene(meshes, materials, lights, name=report.source)
+        if view is None:
+            along = "-Z" if self._axis == "Y" else "+Y"
+            report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
+            view = framing_camera(*scene.bounds(), self._axis)
+        return replace(scene, camera=view, warnings=report.lines(), stats=stats)
+
+    def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
+        """What is drawn, and where; what stays the same at all times is read the first time."""
+        report = self._opened.part()
+        found = walk(self.stage, time, key[:-1], report)
+        moving, staying = Found(), Found()
+        for name in ("shapes", "lights"):
+            for site in getattr(found, name):
+                getattr(moving if self._motion.moves(site.prim) else staying, name).append(site)
+        if self._still is None or key != self._still.key:
+            read = self._opened.part()
+            geometry = build_meshes(staying.shapes, time, read, self._levels)
+            lights = _lights(staying.lights, time, read)
+            self._shapes.clear()
+        else:
+            read, geometry, lights = self._still.read, self._still.geometry, self._still.lights
+        report.include(read)
+        return _Still(key, moving, geometry, lights, read, report)
+
+    def _with_moving(
+        self, still: "_Geometry", sites: Sequence[Site], time: Usd.TimeCode, report: Report
+    ) -> "_Geometry":
+        """All geometry: what stays, what only changes its place, whose shape is read once, and what changes itself."""
+        bends = [self._motion.reshapes(site.prim) for site in sites]
+        rigid = [site for site, b in zip(sites, bends, strict=True) if not b]
+        bending = [site for site, b in zip(sites, bends, strict=True) if b]
+        whole = still
+        for some, shapes in ((rigid, self._shapes), (bending, {})):
+            if some:
+                whole = _join(whole, build_meshes(some, time, report, self._levels, shapes))
+        return whole
+
+
+@dataclass(frozen=True, eq=False)
+class _Still:
+    """What a stage keeps from one moment to the next."""
+
+    key: tuple[Any, ...]
+    """The purposes that are drawn, and whether it was at the default time."""
+    moving: Found
+    """What has to be read each time."""
+    geometry: _Geometry
+    lights: tuple[Light, ...]
+    read: Report
+    """Of the geometry and the lights that stay."""
+    report: Report
+    """The same and of the walk."""
+
+
+def _join(one: _Geometry, other: _Geometry) -> _Geometry:
+    """The meshes of both, one table of materials."""
+    materials = list(one[1]) if one[0] else []
+    known = {material: k for k, material in enumerate(materials)}
+    index = []
+    for material in other[1] if other[0] else ():
+        if material not in known:
+            known[material] = len(materials)
+            materials.append(material)
+        index.append(known[material])
+    renamed = np.array(index, dtype=np.int32)
+    meshes = tuple(replace(mesh, material=renamed[mesh.material]) for mesh in other[0])
+    return (*one[0], *meshes), tuple(materials)
 
 
 def _lights(sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> tuple[Light, ...]:

@@ -24,8 +24,7 @@ class Report:
         self.source = source
         self.stats: Counter[str] = Counter()
         self._strict = strict
-        self._paths: dict[str, dict[str, None]] = {}
-        self._amount: Counter[str] = Counter()
+        self._amounts: dict[str, dict[str, int]] = {}
 
     def warn(self, path: object, what: str, amount: int = 1) -> None:
         """Say that something about a prim was skipped, approximated or guessed.
@@ -38,14 +37,33 @@ class Report:
         text = " ".join(what.split())
         if self._strict:
             raise InputError(f"{self.source}: {path}: {text.replace('{n}', str(amount))}")
-        self._paths.setdefault(text, {})[str(path)] = None
-        self._amount[text] += amount
+        amounts = self._amounts.setdefault(text, {})
+        amounts[str(path)] = amounts.get(str(path), 0) + amount
+
+    def part(self) -> "Report":
+        """An empty report of the same file: of what is read once, to be `include`d in many."""
+        return Report(self.source, strict=self._strict)
+
+    def include(self, part: "Report") -> None:
+        """Say and count what another report has."""
+        self.stats.update(part.stats)
+        for text, amounts in part._amounts.items():
+            mine = self._amounts.setdefault(text, {})
+            for path, amount in amounts.items():
+                mine[path] = mine.get(path, 0) + amount
+
+    def mention(self, other: "Report") -> None:
+        """Say and count what another report has and this one lacks, without counting again what both have."""
+        self.stats.update({name: count for name, count in other.stats.items() if name not in self.stats})
+        for text, amounts in other._amounts.items():
+            mine = self._amounts.setdefault(text, {})
+            mine.update({path: amount for path, amount in amounts.items() if path not in mine})
 
     def lines(self) -> tuple[str, ...]:
         """The warnings in the order in which they first came up."""
         return tuple(
-            f"{_names(list(paths))}: {text.replace('{n}', str(self._amount[text]))}"
-            for text, paths in self._paths.items()
+            f"{_names(list(amounts))}: {text.replace('{n}', str(sum(amounts.values())))}"
+            for text, amounts in self._amounts.items()
         )
 
 

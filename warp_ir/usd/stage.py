@@ -1,11 +1,11 @@
 """Opening a stage: errors in one line, USD's own diagnostics collected instead of spilled."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Tf, Usd, UsdGeom, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from warp_ir.scene import InputError
 from warp_ir.usd.crate import check_sizes
@@ -25,21 +25,52 @@ def quiet() -> Iterator[None]:
         delegate.TakeUncoalescedDiagnostics()
 
 
-def open_stage(path: str, report: Report) -> Usd.Stage:
+def open_stage(
+    path: str,
+    report: Report,
+    *,
+    mask: Sequence[str] = (),
+    needed: Sequence[str] = (),
+    variants: Sequence[str] = (),
+    session_layer: str | None = None,
+) -> Usd.Stage:
     """Open a stage with all its payloads.
 
+    Args:
+        path: Of the root layer.
+        report: Where composition errors go.
+        mask: Paths of prims; if there are any, the stage holds only them, what is above, below and related to them.
+        needed: Paths of prims that it holds beside those of a mask, if there are such.
+        variants: Selections `/prim{set=selection}`, stronger than those of the file.
+        session_layer: A layer that is stronger than the file.
+
     Raises:
-        InputError: The file is missing, is a directory, or is not readable as USD.
+        InputError: A file is missing, is a directory, or is not readable as USD; a path, variant set or selection
+            does not exist.
     """
-    if not Path(path).exists():
-        raise InputError(f"{path}: no such file")
-    if Path(path).is_dir():
-        raise InputError(f"{path}: is a directory, not a USD file")
+    for text in mask:
+        if not (Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsAbsoluteRootOrPrimPath()):
+            raise InputError(f"mask: {text!r} is not the absolute path of a prim")
+    root = _layer(path)
+    # One of our own, so that selecting variants changes nothing that another stage shares.
+    session = Sdf.Layer.CreateAnonymous("session")
+    if session_layer is not None:
+        stronger = _layer(session_layer)
+        session.subLayerPaths.append(stronger.identifier)
     try:
-        check_sizes(path)
-        stage = Usd.Stage.Open(path)
-    except (Tf.ErrorException, RuntimeError, OSError) as error:
-        raise InputError(f"{path}: cannot be opened as USD: {first_message(error).removeprefix(f'{path}:')}") from None
+        if mask:
+            paths = [text for text in needed if Sdf.Path.IsValidPathString(text)]
+            stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask([*mask, *paths]))
+            stage.ExpandPopulationMask()
+        else:
+            stage = Usd.Stage.Open(root, session)
+    except (Tf.ErrorException, RuntimeError) as error:
+        raise _unopened(path, error) from None
+    for text in mask:
+        if not stage.GetPrimAtPath(text):
+            raise InputError(f"mask: there is no prim {text}")
+    for text in variants:
+        _select_variant(stage, text)
     errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
     for text in list(errors)[:_SHOWN]:
         report.warn("/", f"composition: {text}")
@@ -49,10 +80,59 @@ def open_stage(path: str, report: Report) -> Usd.Stage:
     return stage
 
 
-def time_code(stage: Usd.Stage, time: float | None) -> Usd.TimeCode:
-    """The moment to load: as given, else the stage's start, as usdrecord does."""
+def _layer(path: str) -> Sdf.Layer:
+    """A layer.
+
+    Raises:
+        InputError: There is no such file, or it is not readable as USD.
+    """
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such file")
+    if Path(path).is_dir():
+        raise InputError(f"{path}: is a directory, not a USD file")
+    try:
+        check_sizes(path)
+        layer = Sdf.Layer.FindOrOpen(path)
+    except (Tf.ErrorException, RuntimeError, OSError) as error:
+        raise _unopened(path, error) from None
+    if layer is None:
+        raise InputError(f"{path}: cannot be opened as USD: there is no layer in it")
+    return layer
+
+
+def _unopened(path: str, error: Exception) -> InputError:
+    return InputError(f"{path}: cannot be opened as USD: {first_message(error).removeprefix(f'{path}:')}")
+
+
+def _select_variant(stage: Usd.Stage, text: str) -> None:
+    """Makes the selection `/prim{set=selection}`, one or several, in the session layer."""
+    match = re.fullmatch(r"(/[^{}]*)((?:\{[^{}=]+=[^{}=]*\})+)", text.strip())
+    if match is None:
+        raise InputError(f"variant: {text!r} is not of the form /prim{{set=selection}}")
+    prim = stage.GetPrimAtPath(match[1]) if Sdf.Path.IsValidPathString(match[1]) else None
+    if not prim:
+        raise InputError(f"variant: there is no prim {match[1]}")
+    for group, selection in re.findall(r"\{([^{}=]+)=([^{}=]*)\}", match[2]):
+        sets = prim.GetVariantSets()
+        if not sets.HasVariantSet(group):
+            raise InputError(f"variant: {match[1]} has no set {group!r}; it has {', '.join(sets.GetNames()) or 'none'}")
+        there = sets.GetVariantSet(group).GetVariantNames()
+        if selection and selection not in there:
+            raise InputError(f"variant: {match[1]}{{{group}}} has no {selection!r}; it has {', '.join(there)}")
+        try:
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                chosen = sets.GetVariantSet(group)
+                _ = chosen.SetVariantSelection(selection) if selection else chosen.BlockVariantSelection()
+        except Tf.ErrorException:
+            raise InputError(f"variant: {match[1]} is part of an instance; select on the instance itself") from None
+
+
+def time_code(stage: Usd.Stage, time: float | str | None) -> Usd.TimeCode:
+    """The moment to load: as given, else the stage's start, as usdrecord does; "default" is the default time."""
+    if time == "default":
+        return Usd.TimeCode.Default()
     if time is not None:
-        return Usd.TimeCode(time)
+        return Usd.TimeCode(float(time))
     try:
         return Usd.TimeCode(stage.GetStartTimeCode())
     except (Tf.ErrorException, TypeError):  # metadata of another type
