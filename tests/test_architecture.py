@@ -19,7 +19,7 @@ LAYERS = [
     ["profiling"],
     ["launch"],
     ["sampling"],
-    ["procedural", "usd", "bvh"],
+    ["procedural", "usd", "bvh", "texture"],
     ["device_scene"],
     ["surface"],
     ["lights"],

@@ -82,9 +82,11 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.position = hit.position
         sight.normal = hit.normal
         sight.shading_normal = shading_normal(scene, hit)
-        sight.albedo = albedo(scene, hit)
-        sight.emission = emission(scene, hit)
         sight.depth = hit.t + camera.near
+        pixel = wp.sqrt(camera.width * camera.height / float(camera.columns * camera.rows))
+        pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
+        sight.albedo = albedo(scene, hit, pixel)
+        sight.emission = emission(scene, hit, pixel)
         reach = hit.t
     if camera.shows_lights == 1:
         length = wp.length(ray.direction)

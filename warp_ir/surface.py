@@ -8,14 +8,17 @@ may stand: farther than the error, nearer than any detail a float can hold, at a
 
 import warp as wp
 
-from warp_ir.bvh import intersect
+from warp_ir.bvh import RayHit, intersect
 from warp_ir.device_scene import SceneData
+from warp_ir.sampling import hash_combine
+from warp_ir.texture import coordinates, lookup, mip_level
 
 wp.set_module_options({"enable_backward": False})
 
 _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 _MOST_PULL = wp.constant(1.0e-3)  # a needle thinner than its rounding error has no inside
 _INFINITY = wp.constant(3.0e38)
+_MOST_LAYERS = wp.constant(1024)  # open surfaces that a ray passes before it is given up
 
 
 @wp.struct
@@ -29,6 +32,7 @@ class Hit:
     position: wp.vec3  # off the surface, on the side of `normal`: where rays may start
     normal: wp.vec3  # unit geometric normal, on the side the ray came from
     front: int  # 1 if that is the side from which the triangle is wound counter-clockwise
+    area: float  # of the triangle
 
 
 @wp.func
@@ -48,34 +52,118 @@ def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp
 
 
 @wp.func
+def _uv_at(scene: SceneData, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
+    """Texture coordinates at a point of a triangle, and the area of the triangle's image in the uv plane."""
+    row = scene.triangle_uvs[triangle]
+    if row < 0:
+        return wp.vec3(0.0)
+    row += 3 * uv_set
+    a = scene.corner_uvs[row]
+    b = scene.corner_uvs[row + 1]
+    c = scene.corner_uvs[row + 2]
+    uv = u * a + v * b + (1.0 - u - v) * c
+    ab = b - a
+    ac = c - a
+    return wp.vec3(uv[0], uv[1], 0.5 * wp.abs(ab[0] * ac[1] - ab[1] * ac[0]))
+
+
+@wp.func
+def _textured(
+    scene: SceneData, texture: int, triangle: int, u: float, v: float, area: float, footprint: float
+) -> wp.vec3:
+    """A texture at a point of a triangle, as the mean over a patch as wide as `footprint`; 0: as sharp as it is."""
+    row = scene.textures.rows[texture]
+    uv = _uv_at(scene, triangle, row.uv_set, u, v)
+    level = mip_level(scene.textures, row, uv[2] / area, footprint)
+    return lookup(scene.textures, row, coordinates(row, wp.vec2(uv[0], uv[1])), level)
+
+
+@wp.func
+def presence(scene: SceneData, triangle: int, u: float, v: float) -> float:
+    """The share of the rays that meet the surface at a point of a triangle: its opacity, or 0 or 1 with a cutoff."""
+    material = scene.triangle_material[triangle]
+    opacity = scene.opacity[material]
+    if opacity >= 1.0:
+        return 1.0
+    if scene.opacity_texture[material] >= 0:
+        opacity = _textured(scene, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
+    cutoff = scene.cutoff[material]
+    if cutoff > 0.0:
+        return wp.where(opacity < cutoff, 0.0, 1.0)
+    return opacity
+
+
+@wp.func
+def _is_open(scene: SceneData, triangle: int, u: float, v: float) -> bool:
+    """Whether a ray passes a triangle where it meets it; the same ray always does."""
+    there = presence(scene, triangle, u, v)
+    if there <= 0.0 or there >= 1.0:
+        return there <= 0.0
+    bits = hash_combine(hash_combine(wp.uint32(triangle), wp.cast(u, wp.uint32)), wp.cast(v, wp.uint32))
+    return (float(bits >> wp.uint32(8)) + 0.5) * (1.0 / 16777216.0) > there
+
+
+@wp.func
+def _behind(scene: SceneData, found: RayHit, direction: wp.vec3) -> wp.vec3:
+    """Where a ray goes on that has passed a triangle."""
+    a = scene.points[scene.indices[3 * found.triangle]]
+    b = scene.points[scene.indices[3 * found.triangle + 1]]
+    c = scene.points[scene.indices[3 * found.triangle + 2]]
+    n = wp.normalize(wp.cross(b - a, c - a))
+    return offset(a, b, c, found.u, found.v, wp.normalize(direction) + wp.where(found.front == 1, -n, n))
+
+
+@wp.func
 def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest surface along a ray."""
     hit = Hit()
     hit.triangle = -1
-    found = intersect(scene.bvh, origin, direction, t_max, False)
-    if found.triangle >= 0:
-        hit.triangle = found.triangle
-        hit.t = found.t
-        hit.u = found.u
-        hit.v = found.v
-        hit.front = found.front
-        a = scene.points[scene.indices[3 * hit.triangle]]
-        b = scene.points[scene.indices[3 * hit.triangle + 1]]
-        c = scene.points[scene.indices[3 * hit.triangle + 2]]
-        n = wp.normalize(wp.cross(b - a, c - a))
-        hit.normal = wp.where(hit.front == 1, n, -n)
-        # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
-        hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
+    found = RayHit()
+    start = origin
+    passed = float(0.0)
+    for _layer in range(_MOST_LAYERS):  # one query; more only for rays that pass open surfaces
+        found = intersect(scene.bvh, start, direction, t_max - passed, False)
+        if found.triangle < 0:
+            return hit
+        passed += found.t
+        if scene.open_count == 0:
+            break
+        if not _is_open(scene, found.triangle, found.u, found.v):
+            break
+        start = _behind(scene, found, direction)
+    hit.triangle = found.triangle
+    hit.t = passed
+    hit.u = found.u
+    hit.v = found.v
+    hit.front = found.front
+    a = scene.points[scene.indices[3 * hit.triangle]]
+    b = scene.points[scene.indices[3 * hit.triangle + 1]]
+    c = scene.points[scene.indices[3 * hit.triangle + 2]]
+    cross = wp.cross(b - a, c - a)
+    n = wp.normalize(cross)
+    hit.area = 0.5 * wp.length(cross)
+    hit.normal = wp.where(hit.front == 1, n, -n)
+    # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
+    hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
     return hit
 
 
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
-    xyz = wp.vec3(target[0], target[1], target[2])
-    if target[3] == 0.0:
-        return intersect(scene.bvh, origin, xyz, _INFINITY, True).triangle < 0
-    return intersect(scene.bvh, origin, xyz - origin, 0.999999, True).triangle < 0
+    start = origin
+    way = wp.vec3(target[0], target[1], target[2]) - origin * target[3]
+    reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
+    any_hit = scene.open_count == 0
+    for _layer in range(_MOST_LAYERS):
+        found = intersect(scene.bvh, start, way, reach, any_hit)
+        if found.triangle < 0:
+            return True
+        if any_hit or not _is_open(scene, found.triangle, found.u, found.v):
+            return False
+        start = _behind(scene, found, way)
+        reach -= found.t
+    return False
 
 
 @wp.func
@@ -96,11 +184,15 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
 
 
 @wp.func
-def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
-    """Hemispherical reflectance ρ at a hit."""
+def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
+    """Hemispherical reflectance ρ at a hit, as the mean over a patch as wide as `footprint` where it is textured."""
     row = scene.triangle_colors[hit.triangle]
     if row < 0:
-        return scene.albedo[scene.triangle_material[hit.triangle]]
+        material = scene.triangle_material[hit.triangle]
+        if scene.textures.count > 0:
+            if scene.albedo_texture[material] >= 0:
+                return _textured(scene, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint)
+        return scene.albedo[material]
     return (
         hit.u * scene.corner_colors[row]
         + hit.v * scene.corner_colors[row + 1]
@@ -109,8 +201,18 @@ def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
 
 
 @wp.func
-def emission(scene: SceneData, hit: Hit) -> wp.vec3:
+def emitted(scene: SceneData, triangle: int, u: float, v: float, area: float, footprint: float) -> wp.vec3:
+    """Radiance [W sr⁻¹ m⁻²] that the emitting side of a triangle emits at a point, if the surface is there."""
+    material = scene.triangle_material[triangle]
+    if scene.textures.count > 0:
+        if scene.emission_texture[material] >= 0:
+            return _textured(scene, scene.emission_texture[material], triangle, u, v, area, footprint)
+    return scene.emission[material]
+
+
+@wp.func
+def emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     """Radiance [W sr⁻¹ m⁻²] that a surface emits towards the ray that hit it."""
     if hit.front == 1 or scene.emits_back[hit.triangle] == 1:
-        return scene.emission[scene.triangle_material[hit.triangle]]
+        return emitted(scene, hit.triangle, hit.u, hit.v, hit.area, footprint)
     return wp.vec3(0.0)
