@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_ir.mipmap import mip_chain, resized
 from warp_ir.scene import Texture, Wrap
-from warp_ir.texture import (
-    TextureTable,
-    coordinates,
-    lookup,
-    mean_on_triangles,
-    mip_chain,
-    mip_level,
-    resized,
-    upload_textures,
-)
+from warp_ir.texture import TextureTable, coordinates, lookup, mean_on_triangles, mip_level, upload_textures
 
 wp.set_module_options({"enable_backward": False})
 

@@ -186,12 +186,12 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
 @wp.func
 def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     """Hemispherical reflectance ρ at a hit, as the mean over a patch as wide as `footprint` where it is textured."""
+    material = scene.triangle_material[hit.triangle]
+    if scene.textures.count > 0:
+        if scene.albedo_texture[material] >= 0:
+            return _textured(scene, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint)
     row = scene.triangle_colors[hit.triangle]
     if row < 0:
-        material = scene.triangle_material[hit.triangle]
-        if scene.textures.count > 0:
-            if scene.albedo_texture[material] >= 0:
-                return _textured(scene, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint)
         return scene.albedo[material]
     return (
         hit.u * scene.corner_colors[row]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.launch import Launcher
+from warp_ir.mipmap import mip_chain, resized
 from warp_ir.scene import Floats, Texture, Wrap
 
 wp.set_module_options({"enable_backward": False})
@@ -170,36 +171,6 @@ def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launche
     table.levels = launcher.array(np.array(levels or [(1, 1, 0)], np.int32), wp.vec3i)
     table.texels = launcher.array(np.concatenate(texels) if texels else np.zeros(1, np.float16), wp.float16)
     return table
-
-
-def mip_chain(pixels: Floats) -> list[Floats]:
-    """The image [h, w, c] and ever smaller ones, down to one pixel, all of the same mean."""
-    chain = [np.asarray(pixels, np.float32)]
-    while max(chain[-1].shape[:2]) > 1:
-        height, width = (max(n // 2, 1) for n in chain[-1].shape[:2])
-        chain.append(resized(chain[-1], height, width))
-    return chain
-
-
-def resized(pixels: Floats, height: int, width: int) -> Floats:
-    """Means [height, width, c] over equal parts of an image, pixels on their borders shared in proportion."""
-    h, w = pixels.shape[:2]
-    if (h, w) == (2 * height, 2 * width):
-        quarters = pixels.reshape(height, 2, width, 2, -1)
-        return np.asarray(quarters.mean(axis=(1, 3), dtype=np.float32))
-    out = np.asarray(pixels, np.float64)
-    for axis, size in ((0, height), (1, width)):
-        count = out.shape[axis]
-        if count == size:
-            continue
-        # Differences of the integral, which is linear between the pixels' edges.
-        sums = np.concatenate([np.zeros_like(np.take(out, [0], axis)), np.cumsum(out, axis=axis)], axis=axis)
-        edges = np.arange(size + 1) * (count / size)
-        below = np.minimum(edges.astype(np.int64), count - 1)
-        rest = (edges - below).reshape([-1 if k == axis else 1 for k in range(out.ndim)])
-        integral = np.take(sums, below, axis) + rest * np.take(out, below, axis)
-        out = np.diff(integral, axis=axis) * (size / count)
-    return out.astype(np.float32)
 
 
 def _within_budget(textures: Sequence[Texture]) -> list[Floats]:

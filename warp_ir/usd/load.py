@@ -20,6 +20,9 @@ _COUNTED = (
     "meshes",
     "triangles",
     "materials",
+    "images",
+    "textures",
+    "texels",
     "lights",
     "instances",
     "native_instances",
@@ -46,6 +49,8 @@ def load_usd(
     purposes: Sequence[str] = ("default", "render"),
     complexity: str = "low",
     default_light: str = "dome",
+    metals: str = "diffuse",
+    texture_wrap: str = "black",
     strict: bool = False,
 ) -> Scene:
     """Load a USD file for rendering.
@@ -61,6 +66,9 @@ def load_usd(
         complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
             after one, two and three levels of refinement.
         default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
+        metals: "diffuse" renders a metal as a diffuse surface of its base colour, "black" without its reflection.
+        texture_wrap: What textures are beyond their edges where nothing says it: "black" as the specification has it,
+            "clamp", "repeat" or "mirror".
         strict: Whether the first warning is an error.
 
     Raises:
@@ -74,6 +82,10 @@ def load_usd(
         raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
     if default_light not in ("dome", "none"):
         raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
+    if metals not in ("diffuse", "black"):
+        raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
+    if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
+        raise InputError(f"texture_wrap: '{texture_wrap}' is not one of black, clamp, repeat, mirror")
     if time is not None and not math.isfinite(time):
         raise InputError(f"time: {time} is not a finite number")
     report = Report(source, strict=strict)
@@ -81,7 +93,9 @@ def load_usd(
     with quiet(), np.errstate(all="ignore"):
         stage = open_stage(source, report)
         try:
-            return _load(stage, time_code(stage, time), camera, purposes, _LEVELS[complexity], default_light, report)
+            levels = _LEVELS[complexity]
+            moment = time_code(stage, time)
+            return _load(stage, moment, camera, purposes, levels, default_light, metals, texture_wrap, report)
         except Tf.ErrorException as error:  # damage that shows only when the value is unpacked
             raise InputError(f"{source}: cannot be read: {first_message(error)}") from None
 
@@ -93,13 +107,15 @@ def _load(
     purposes: Sequence[str],
     levels: int,
     default_light: str,
+    metals: str,
+    texture_wrap: str,
     report: Report,
 ) -> Scene:
     chosen = find_camera(stage, camera, report)
     view = None if chosen is None else read_camera(chosen, time, report)
     axis = up_axis(stage, report)
     found = walk(stage, time, purposes, report)
-    meshes, materials = build_meshes(found.shapes, time, report, levels)
+    meshes, materials = build_meshes(found.shapes, time, report, levels, texture_wrap, metals)
     lights = _lights(found.lights, time, report)
     if not meshes:
         hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
@@ -110,6 +126,9 @@ def _load(
     stats = dict.fromkeys(_COUNTED, 0) | report.stats
     stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
     stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
+    textures = {texture for material in materials for texture in material.textures}
+    stats["textures"] = len(textures)
+    stats["texels"] = sum(texture.pixels.shape[0] * texture.pixels.shape[1] for texture in textures)
     stats["instances"] = stats["native_instances"] + stats["point_instances"]
     scene = Scene(meshes, materials, lights, name=report.source)
     if view is None:
