@@ -302,7 +302,7 @@ class Network:
         attribute = value.producer(node.GetInput("file"))
         space = self._text(node.GetInput("sourceColorSpace"), "auto")
         try:
-            image, pixels, key, atlas = self._pixels(attribute, space, fallback)
+            image, pixels, key, atlas = self._pixels(attribute, space, fallback, channels)
         except Unreadable as trouble:
             self.warn(f"{trouble}; the texture's fallback is used")
             return constant(*fallback[channels].tolist())
@@ -315,12 +315,12 @@ class Network:
         uv, transform = self._coordinates(node.GetInput("st"), _DEPTH, unconnected=_at(0.0, 0.0))
         place = _placed(uv, transform, (wraps[0], wraps[1]), atlas)
         outside = fallback if atlas != (1, 1) else np.zeros(4)  # black is transparent black
-        signal = Signal(pixels, outside, place, key, attribute.Get(self._time).path if attribute else "")
-        signal = select(signal, channels)
+        key = (key, tuple(channels))
+        signal = Signal(pixels, outside[channels], place, key, attribute.Get(self._time).path if attribute else "")
         if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
             return signal
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
-        return combine(label, lambda a: a * scale[channels] + bias[channels], signal)
+        return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), signal)
 
     def _image(self, node: UsdShade.Shader, name: str) -> Signal:
         """MaterialX's image and tiledimage."""
@@ -330,7 +330,8 @@ class Network:
         attribute = value.producer(node.GetInput("file"))
         try:
             space = "auto" if wanted.startswith("color") else "raw"
-            _, pixels, key, atlas = self._pixels(attribute, space, np.resize(default, 4))
+            channels = list(range(count))
+            _, pixels, key, atlas = self._pixels(attribute, space, np.resize(default, 4), channels)
         except Unreadable as trouble:
             self.warn(f"{trouble}; the image's default is used")
             return constant(*default.tolist())
@@ -345,13 +346,12 @@ class Network:
             modes = [Wrap.REPEAT, Wrap.REPEAT]
             transform = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]]) @ transform
         place = _placed(uv, transform, (modes[0], modes[1]), atlas)
-        signal = Signal(pixels, np.resize(default, 4), place, key, attribute.Get(self._time).path if attribute else "")
-        return select(signal, list(range(count)))
+        return Signal(pixels, default, place, (key, count), attribute.Get(self._time).path if attribute else "")
 
     def _pixels(
-        self, attribute: Usd.Attribute | None, space: str, fallback: Floats
+        self, attribute: Usd.Attribute | None, space: str, fallback: Floats, channels: list[int]
     ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
-        """The image that an attribute names: itself, rgba [h, w, 4], a key, and how many UDIM tiles lie in it."""
+        """The image that an attribute names: itself, some of its channels rgba [h, w, c], a key, its UDIM tiles."""
         asset = value.raw(attribute, self._time) if attribute is not None else None
         if isinstance(asset, str):
             asset = Sdf.AssetPath(asset)
@@ -363,14 +363,13 @@ class Network:
         elif space == "auto" and authored and authored != "auto":
             space = "raw"
         if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
-            return self._udim(attribute, asset, space, fallback)
+            return self._udim(attribute, asset, space, fallback, channels)
         image = self._images.read(asset, space)
-        pixels = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
-        pixels = _converted(pixels, authored)
+        pixels = _converted(_channels(image, channels), authored)
         return image, pixels, (asset.resolvedPath or asset.path, space, authored), (1, 1)
 
     def _udim(
-        self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats
+        self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats, channels: list[int]
     ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
         """The tiles of a UDIM set side by side in one image; those that are missing show the fallback."""
         stack = attribute.GetPropertyStack(self._time)
@@ -392,16 +391,16 @@ class Network:
         width = max(image.pixels.shape[1] for image in images.values())
         shrink = math.sqrt(min(MAX_PIXELS / (height * width * columns * rows), 1.0))
         height, width = max(int(height * shrink), 1), max(int(width * shrink), 1)
-        atlas = np.empty((rows * height, columns * width, 4), np.float32)
-        atlas[:] = fallback
+        atlas = np.empty((rows * height, columns * width, len(channels)), np.float16)
+        atlas[:] = fallback[channels]
         for at, image in images.items():
-            tile = np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)
+            tile = _channels(image, channels)
             if tile.shape[:2] != (height, width):
                 tile = resized(tile, height, width)
             top, left = (rows - 1 - at // 10) * height, at % 10 * width
             atlas[top : top + height, left : left + width] = tile
         first = next(iter(images.values()))
-        return first, _compact(atlas), (asset.path, tuple(sorted(places.items())), space), (columns, rows)
+        return first, atlas, (asset.path, tuple(sorted(places.items())), space), (columns, rows)
 
     def _coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
         """The uv set that an input reads, and what is done to it, [3, 3]."""
@@ -450,8 +449,21 @@ class Network:
         return value.text(attribute, self._time, default) or default if attribute is not None else default
 
 
+def _channels(image: Image, channels: list[int]) -> Floats:
+    """Channels of an image as if it had r, g, b and a, [h, w, c]; without a copy where possible."""
+    pixels, count = image.pixels, image.pixels.shape[2]
+    if channels == [0, 1, 2] and count >= 3:
+        return pixels[..., :3]
+    if channels == [3]:
+        return image.alpha[..., None]
+    planes = [image.rgb[..., c] if c < 3 else image.alpha for c in channels]
+    return planes[0][..., None] if len(planes) == 1 else np.stack(planes, axis=-1)
+
+
 def _converted(pixels: Floats, space: str) -> Floats:
-    """Linear pixels [h, w, 4] of a colour space as Rec.709."""
+    """Linear pixels [h, w, 3 or 4] of a colour space as Rec.709; fewer channels are no colour."""
+    if pixels.shape[2] < 3:
+        return pixels
     name = _LINEAR_NAMES.get(space.lower(), space)
     if name.lower() in _UNSAID or space in _SRGB_NAMES or not Gf.ColorSpace.IsValid(name):
         return pixels
