@@ -32,6 +32,15 @@ _TRIANGLE_EMITTER = len(LightKind)
 
 
 @wp.struct
+class Patterns:
+    """The textures, and where they lie."""
+
+    textures: TextureTable
+    triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
+    corner_uvs: wp.array[wp.vec2]
+
+
+@wp.struct
 class SceneData:
     """Geometry, materials and emitters. Empty tables hold one unused row; the counts tell."""
 
@@ -45,8 +54,6 @@ class SceneData:
     triangle_colors: wp.array[wp.int32]  # [m], first of its three rows in corner_colors; -1: the material's
     corner_normals: wp.array[wp.vec3]
     corner_colors: wp.array[wp.vec3]
-    triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
-    corner_uvs: wp.array[wp.vec2]
     albedo: wp.array[wp.vec3]  # [materials]
     emission: wp.array[wp.vec3]  # [materials] radiance
     opacity: wp.array[wp.float32]  # [materials]
@@ -54,7 +61,8 @@ class SceneData:
     albedo_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
     emission_texture: wp.array[wp.int32]
     opacity_texture: wp.array[wp.int32]
-    textures: TextureTable
+    texture_count: int
+    patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
     open_count: int  # materials whose opacity is below 1 anywhere
     footprint: float  # width of the patch that a reflection of light stands for
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
@@ -275,7 +283,7 @@ def _check_mesh(mesh: Mesh, material_count: int) -> None:
 
 
 def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
-    """Fills the geometry and material tables; returns the BVH's owner."""
+    """Fills the geometry and material tables; returns the owners of what they refer to by address."""
     meshes = [m for m in scene.meshes if len(m.triangles)]
     data.triangle_count = sum(len(m.triangles) for m in meshes)
     if meshes:
@@ -299,15 +307,15 @@ def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     )
     data.triangle_normals, data.corner_normals = _upload_corners([m.normals for m in meshes], counts, launcher)
     data.triangle_colors, data.corner_colors = _upload_corners([m.colors for m in meshes], counts, launcher)
-    _upload_materials(scene.materials or (Material(),), meshes, counts, data, launcher)
+    patterns = _upload_materials(scene.materials or (Material(),), meshes, counts, data, launcher)
     data.bvh, owner = build_bvh(data.points, data.indices, launcher)
-    return owner
+    return owner, patterns
 
 
 def _upload_materials(
     materials: tuple[Material, ...], meshes: list[Mesh], counts: list[int], data: Any, launcher: Launcher
-) -> None:
-    """Fills the tables of materials and textures, and the uv sets that the textures use."""
+) -> Any:
+    """Fills the tables of materials and textures, and the uv sets that the textures use; returns their owner."""
     textures = list(dict.fromkeys(texture for material in materials for texture in material.textures))
     row: dict[Texture | None, int] = {texture: k for k, texture in enumerate(textures)} | {None: -1}
     uv_sets = list(dict.fromkeys(texture.uv for texture in textures))
@@ -319,7 +327,9 @@ def _upload_materials(
     data.emission_texture = launcher.array([row[m.emission_texture] for m in materials], wp.int32)
     data.opacity_texture = launcher.array([row[m.opacity_texture] for m in materials], wp.int32)
     data.open_count = sum(m.opacity < 1.0 for m in materials)
-    data.textures = upload_textures(textures, uv_sets, launcher)
+    data.texture_count = len(textures)
+    patterns = Patterns()
+    patterns.textures = upload_textures(textures, uv_sets, launcher)
     corners: list[Any] = []
     for mesh in meshes:
         sets = [mesh.uvs.get(name) for name in uv_sets]
@@ -329,7 +339,10 @@ def _upload_materials(
             zero = np.zeros((len(mesh.triangles), 3, 2), np.float32)
             chosen = np.stack([zero if s is None else s for s in sets], axis=1)
             corners.append(np.asarray(chosen, np.float32).clip(-_LARGEST_UV, _LARGEST_UV))
-    data.triangle_uvs, data.corner_uvs = _upload_corners(corners, counts, launcher, wp.vec2, 3 * max(len(uv_sets), 1))
+    rows = 3 * max(len(uv_sets), 1)
+    patterns.triangle_uvs, patterns.corner_uvs = _upload_corners(corners, counts, launcher, wp.vec2, rows)
+    data.patterns = launcher.array([patterns], Patterns)
+    return patterns
 
 
 def _upload_corners(

@@ -8,8 +8,8 @@ may stand: farther than the error, nearer than any detail a float can hold, at a
 
 import warp as wp
 
-from warp_ir.bvh import RayHit, intersect
-from warp_ir.device_scene import SceneData
+from warp_ir.bvh import intersect
+from warp_ir.device_scene import Patterns, SceneData
 from warp_ir.sampling import hash_combine
 from warp_ir.texture import coordinates, lookup, mip_level
 
@@ -52,30 +52,31 @@ def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp
 
 
 @wp.func
-def _uv_at(scene: SceneData, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
+def _uv_at(patterns: Patterns, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
     """Texture coordinates at a point of a triangle, and the area of the triangle's image in the uv plane."""
-    row = scene.triangle_uvs[triangle]
+    row = patterns.triangle_uvs[triangle]
     if row < 0:
         return wp.vec3(0.0)
     row += 3 * uv_set
-    a = scene.corner_uvs[row]
-    b = scene.corner_uvs[row + 1]
-    c = scene.corner_uvs[row + 2]
+    a = patterns.corner_uvs[row]
+    b = patterns.corner_uvs[row + 1]
+    c = patterns.corner_uvs[row + 2]
     uv = u * a + v * b + (1.0 - u - v) * c
     ab = b - a
     ac = c - a
     return wp.vec3(uv[0], uv[1], 0.5 * wp.abs(ab[0] * ac[1] - ab[1] * ac[0]))
 
 
-@wp.func
+@wp.func(inline=False)  # so that scenes without textures do not carry the code about
 def _textured(
-    scene: SceneData, texture: int, triangle: int, u: float, v: float, area: float, footprint: float
+    patterns: wp.array[Patterns], texture: int, triangle: int, u: float, v: float, area: float, footprint: float
 ) -> wp.vec3:
     """A texture at a point of a triangle, as the mean over a patch as wide as `footprint`; 0: as sharp as it is."""
-    row = scene.textures.rows[texture]
-    uv = _uv_at(scene, triangle, row.uv_set, u, v)
-    level = mip_level(scene.textures, row, uv[2] / area, footprint)
-    return lookup(scene.textures, row, coordinates(row, wp.vec2(uv[0], uv[1])), level)
+    p = patterns[0]
+    row = p.textures.rows[texture]
+    uv = _uv_at(p, triangle, row.uv_set, u, v)
+    level = mip_level(p.textures, row, uv[2] / area, footprint)
+    return lookup(p.textures, row, coordinates(row, wp.vec2(uv[0], uv[1])), level)
 
 
 @wp.func
@@ -86,7 +87,7 @@ def presence(scene: SceneData, triangle: int, u: float, v: float) -> float:
     if opacity >= 1.0:
         return 1.0
     if scene.opacity_texture[material] >= 0:
-        opacity = _textured(scene, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
+        opacity = _textured(scene.patterns, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
     cutoff = scene.cutoff[material]
     if cutoff > 0.0:
         return wp.where(opacity < cutoff, 0.0, 1.0)
@@ -104,66 +105,67 @@ def _is_open(scene: SceneData, triangle: int, u: float, v: float) -> bool:
 
 
 @wp.func
-def _behind(scene: SceneData, found: RayHit, direction: wp.vec3) -> wp.vec3:
-    """Where a ray goes on that has passed a triangle."""
-    a = scene.points[scene.indices[3 * found.triangle]]
-    b = scene.points[scene.indices[3 * found.triangle + 1]]
-    c = scene.points[scene.indices[3 * found.triangle + 2]]
-    n = wp.normalize(wp.cross(b - a, c - a))
-    return offset(a, b, c, found.u, found.v, wp.normalize(direction) + wp.where(found.front == 1, -n, n))
+def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest triangle along a ray, open or not."""
+    hit = Hit()
+    hit.triangle = -1
+    found = intersect(scene.bvh, origin, direction, t_max, False)
+    if found.triangle >= 0:
+        hit.triangle = found.triangle
+        hit.t = found.t
+        hit.u = found.u
+        hit.v = found.v
+        hit.front = found.front
+        a = scene.points[scene.indices[3 * hit.triangle]]
+        b = scene.points[scene.indices[3 * hit.triangle + 1]]
+        c = scene.points[scene.indices[3 * hit.triangle + 2]]
+        cross = wp.cross(b - a, c - a)
+        hit.area = 0.5 * wp.length(cross)
+        n = wp.normalize(cross)
+        hit.normal = wp.where(hit.front == 1, n, -n)
+        # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
+        hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
+    return hit
+
+
+@wp.func(inline=False)
+def _nearest_present(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest triangle that is there where the ray meets it."""
+    start = origin
+    passed = float(0.0)
+    for _layer in range(_MOST_LAYERS):
+        hit = _nearest(scene, start, direction, t_max - passed)
+        if hit.triangle < 0:
+            return hit
+        passed += hit.t
+        if not _is_open(scene, hit.triangle, hit.u, hit.v):
+            hit.t = passed
+            return hit
+        a = scene.points[scene.indices[3 * hit.triangle]]
+        b = scene.points[scene.indices[3 * hit.triangle + 1]]
+        c = scene.points[scene.indices[3 * hit.triangle + 2]]
+        start = offset(a, b, c, hit.u, hit.v, wp.normalize(direction) - hit.normal)
+    nothing = Hit()
+    nothing.triangle = -1
+    return nothing
 
 
 @wp.func
 def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest surface along a ray."""
-    hit = Hit()
-    hit.triangle = -1
-    found = RayHit()
-    start = origin
-    passed = float(0.0)
-    for _layer in range(_MOST_LAYERS):  # one query; more only for rays that pass open surfaces
-        found = intersect(scene.bvh, start, direction, t_max - passed, False)
-        if found.triangle < 0:
-            return hit
-        passed += found.t
-        if scene.open_count == 0:
-            break
-        if not _is_open(scene, found.triangle, found.u, found.v):
-            break
-        start = _behind(scene, found, direction)
-    hit.triangle = found.triangle
-    hit.t = passed
-    hit.u = found.u
-    hit.v = found.v
-    hit.front = found.front
-    a = scene.points[scene.indices[3 * hit.triangle]]
-    b = scene.points[scene.indices[3 * hit.triangle + 1]]
-    c = scene.points[scene.indices[3 * hit.triangle + 2]]
-    cross = wp.cross(b - a, c - a)
-    n = wp.normalize(cross)
-    hit.area = 0.5 * wp.length(cross)
-    hit.normal = wp.where(hit.front == 1, n, -n)
-    # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
-    hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
-    return hit
+    if scene.open_count > 0:
+        return _nearest_present(scene, origin, direction, t_max)
+    return _nearest(scene, origin, direction, t_max)
 
 
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
-    start = origin
     way = wp.vec3(target[0], target[1], target[2]) - origin * target[3]
     reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
-    any_hit = scene.open_count == 0
-    for _layer in range(_MOST_LAYERS):
-        found = intersect(scene.bvh, start, way, reach, any_hit)
-        if found.triangle < 0:
-            return True
-        if any_hit or not _is_open(scene, found.triangle, found.u, found.v):
-            return False
-        start = _behind(scene, found, way)
-        reach -= found.t
-    return False
+    if scene.open_count > 0:
+        return _nearest_present(scene, origin, way, reach).triangle < 0
+    return intersect(scene.bvh, origin, way, reach, True).triangle < 0
 
 
 @wp.func
@@ -187,9 +189,11 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
 def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     """Hemispherical reflectance ρ at a hit, as the mean over a patch as wide as `footprint` where it is textured."""
     material = scene.triangle_material[hit.triangle]
-    if scene.textures.count > 0:
+    if scene.texture_count > 0:
         if scene.albedo_texture[material] >= 0:
-            return _textured(scene, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint)
+            return _textured(
+                scene.patterns, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
+            )
     row = scene.triangle_colors[hit.triangle]
     if row < 0:
         return scene.albedo[material]
@@ -204,9 +208,9 @@ def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
 def emitted(scene: SceneData, triangle: int, u: float, v: float, area: float, footprint: float) -> wp.vec3:
     """Radiance [W sr⁻¹ m⁻²] that the emitting side of a triangle emits at a point, if the surface is there."""
     material = scene.triangle_material[triangle]
-    if scene.textures.count > 0:
+    if scene.texture_count > 0:
         if scene.emission_texture[material] >= 0:
-            return _textured(scene, scene.emission_texture[material], triangle, u, v, area, footprint)
+            return _textured(scene.patterns, scene.emission_texture[material], triangle, u, v, area, footprint)
     return scene.emission[material]
 
 
