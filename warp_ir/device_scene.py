@@ -87,6 +87,7 @@ class SceneData:
     shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
 
     sobol: wp.array[wp.uint32]
+    address: wp.uint64  # of a copy of this record on the device: what is called seldom takes no more than this
 
 
 @wp.struct
@@ -170,6 +171,8 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
         shapes = _upload_lights(scene.lights, frame, data, launcher)
         _upload_emitters(scene, frame, data, launcher)
         data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+        itself = launcher.array([data], SceneData)
+        data.address = wp.uint64(itself.ptr)
         colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
         used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
         colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
@@ -181,7 +184,7 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
             mean_albedo=scene.mean_albedo(),
             max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
             emits=data.emitter_count > 0,
-            keep=(mesh, shapes),
+            keep=(mesh, shapes, itself),
         )
 
 

@@ -128,9 +128,23 @@ def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float
     return hit
 
 
-@wp.func(inline=False)
-def _nearest_present(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+@wp.func_native(f"""
+    wp::array_t<{SceneData.native_name}> one;
+    one.data = ({SceneData.native_name}*)address;
+    one.shape[0] = 1;
+    one.strides[0] = sizeof({SceneData.native_name});
+    one.ndim = 1;
+    return one;
+""")
+def _scene_at(address: wp.uint64) -> wp.array[SceneData]:
+    """The record at `SceneData.address`."""
+    ...
+
+
+@wp.func(inline=False)  # and by address: handing on the whole record takes it out of the registers of the caller
+def _nearest_present(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest triangle that is there where the ray meets it."""
+    scene = _scene_at(address)[0]
     start = origin
     passed = float(0.0)
     for _layer in range(_MOST_LAYERS):
@@ -154,7 +168,7 @@ def _nearest_present(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_ma
 def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest surface along a ray."""
     if scene.open_count > 0:
-        return _nearest_present(scene, origin, direction, t_max)
+        return _nearest_present(scene.address, origin, direction, t_max)
     return _nearest(scene, origin, direction, t_max)
 
 
@@ -164,7 +178,7 @@ def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     way = wp.vec3(target[0], target[1], target[2]) - origin * target[3]
     reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
     if scene.open_count > 0:
-        return _nearest_present(scene, origin, way, reach).triangle < 0
+        return _nearest_present(scene.address, origin, way, reach).triangle < 0
     return intersect(scene.bvh, origin, way, reach, True).triangle < 0
 
 
