@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdShade
 
-from warp_ir.scene import Color, Floats, Material
+from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd.light import BRIGHTEST
 from warp_ir.usd.network import Images, Network, Signal, as_color, combine, constant
 from warp_ir.usd.report import Unreadable
@@ -158,14 +158,16 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _unit, albedo)
-    if emission.pixels.max() >= BRIGHTEST:
+    if float(emission.pixels.max()) >= BRIGHTEST:
         inputs.warn(f"emission {_numbers(emission)} is beyond reason; it emits nothing")
         emission = constant(*_BLACK)
     if emission.pixels.min() < 0.0:
         inputs.warn(f"negative emission {_numbers(emission)} clamped to 0")
         emission = combine("positive", lambda e: np.clip(e, 0.0, math.inf), emission)
     opacity = combine("clip", _unit, opacity)
-    values = np.append(opacity.pixels.reshape(-1), opacity.outside if opacity.place else [])
+    values = opacity.pixels.reshape(-1)
+    if opacity.place is not None and Wrap.BLACK in opacity.place.wrap:
+        values = np.append(values, opacity.outside)
     if threshold > 0.0:
         values = (values >= threshold).astype(np.float64)
     if values.max() <= 0.0:
