@@ -20,6 +20,8 @@ def load_scene(args: argparse.Namespace, time: float | None) -> Scene:
         purposes=tuple(dict.fromkeys(("default", *args.purposes))),
         complexity=args.complexity,
         default_light=args.default_light,
+        metals=args.metals,
+        texture_wrap=args.texture_wrap,
         strict=args.strict,
     )
     return scene
