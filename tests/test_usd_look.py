@@ -354,3 +354,36 @@ def test_real_files(file, images):
     assert scene.stats["images"] == images
     settings = ir.RenderSettings(width=16, height=16, iterations=1, light_paths=64)
     assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()
+
+
+def test_what_is_read_in_vain_is_named(tmp_path, image):
+    """Normal maps, and primvars where only constants and images count, are said once; unset interfaces are not."""
+    assert warned(load(tmp_path, textured(target="normal3f inputs:normal") + mesh()), "/A", "normal", "not rendered")
+    opacity = textured(target="float inputs:opacity", output="result").replace("UsdUVTexture", "UsdPrimvarReader_float")
+    opacity = opacity.replace(
+        "asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1'
+    )
+    assert warned(load(tmp_path, opacity + mesh()), "/A", "opacity", "'veil'")
+    plain = material_text("normal3f inputs:normal.connect = </A.inputs:unset>").replace(
+        "token outputs:surface.connect", "normal3f inputs:unset\n token outputs:surface.connect"
+    )
+    assert not warned(load(tmp_path, plain + mesh("")), "normal")
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        "float4 inputs:scale = (1e38, 1e38, 1e38, 1)",
+        "float4 inputs:scale = (nan, 1, 1, 1)",
+        "float4 inputs:bias = (inf, 0, 0, 0)",
+        'token inputs:wrapS = "sideways"',
+        "int inputs:sourceColorSpace = 3",
+        "float4 inputs:fallback = (nan, nan, nan, nan)",
+        "float2 inputs:st = (1e38, -1e38)",
+    ],
+)
+def test_absurd_numbers_render(tmp_path, image, inputs):
+    """Whatever a node says, the scene loads and its picture is finite."""
+    scene = load(tmp_path, textured(inputs) + mesh())
+    settings = ir.RenderSettings(width=4, height=4, iterations=1, light_paths=16)
+    assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()

@@ -81,7 +81,8 @@ def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> 
     images = [s for s in signals if s.place is not None]
     key = (label, *(s.key for s in signals))
     if not images:
-        return Signal(function(*(s.pixels for s in signals)), function(*(s.outside for s in signals)), None, key)
+        made = _finite(function(*(s.pixels for s in signals)))
+        return Signal(made, made[0, 0], None, key)
     first = images[0]
     together = [s for s in images if s.place == first.place]
     height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
@@ -94,9 +95,14 @@ def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> 
             fits = s.place is None or s.pixels.shape[:2] == (height, width)
             pixels.append(s.pixels if fits else resized(s.pixels, height, width))
             outside.append(s.outside)
-    made = np.asarray(function(*(np.asarray(p, np.float32) for p in pixels)))
+    made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
     made = np.broadcast_to(made, (height, width, made.shape[-1]))
-    return Signal(_compact(made), np.asarray(function(*outside)), first.place, key, first.name)
+    return Signal(_compact(made), _finite(function(*outside)), first.place, key, first.name)
+
+
+def _finite(values: Floats) -> Floats:
+    """Arithmetic in a file may overflow."""
+    return np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
 
 
 def select(signal: Signal, channels: list[int]) -> Signal:
@@ -249,7 +255,10 @@ class Network:
         """MaterialX's arithmetic; None if the node is none."""
 
         def get(key: str, *default: float) -> Signal:
-            return self._input(node.GetInput(key), constant(*default), depth)
+            found = self._input(node.GetInput(key), constant(*default), depth)
+            if found.primvar:
+                self.warn(f"arithmetic on the primvar '{found.primvar}' is not read: it counts as its fallback")
+            return replace(found, primvar="")
 
         kind = name.split("_")[0]
         if kind == "constant":
@@ -316,7 +325,7 @@ class Network:
         place = _placed(uv, transform, (wraps[0], wraps[1]), atlas)
         outside = fallback if atlas != (1, 1) else np.zeros(4)  # black is transparent black
         key = (key, tuple(channels))
-        signal = Signal(pixels, outside[channels], place, key, attribute.Get(self._time).path if attribute else "")
+        signal = Signal(pixels, outside[channels], place, key, self._path(attribute))
         if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
             return signal
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
@@ -346,7 +355,12 @@ class Network:
             modes = [Wrap.REPEAT, Wrap.REPEAT]
             transform = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]]) @ transform
         place = _placed(uv, transform, (modes[0], modes[1]), atlas)
-        return Signal(pixels, default, place, (key, count), attribute.Get(self._time).path if attribute else "")
+        return Signal(pixels, default, place, (key, count), self._path(attribute))
+
+    def _path(self, attribute: Usd.Attribute | None) -> str:
+        """The path that an asset attribute holds."""
+        asset = value.raw(attribute, self._time) if attribute is not None else None
+        return asset.path if isinstance(asset, Sdf.AssetPath) else str(asset or "")
 
     def _pixels(
         self, attribute: Usd.Attribute | None, space: str, fallback: Floats, channels: list[int]

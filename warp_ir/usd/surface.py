@@ -12,6 +12,7 @@ import numpy as np
 from pxr import Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
+from warp_ir.usd import value
 from warp_ir.usd.light import BRIGHTEST
 from warp_ir.usd.network import Images, Network, Signal, as_color, combine, constant
 from warp_ir.usd.report import Unreadable
@@ -73,12 +74,24 @@ class _Inputs:
 
     def color(self, name: str, default: Color) -> Signal:
         """A colour."""
-        return as_color(self.network.evaluate(self._shader.GetInput(name), constant(*default)))
+        found = self.network.evaluate(self._shader.GetInput(name), constant(*default))
+        if found.primvar and name not in ("diffuseColor", "base_color"):
+            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
+        return as_color(found)
 
     def grey(self, name: str, default: float) -> Signal:
         """One channel."""
         found = self.network.evaluate(self._shader.GetInput(name), constant(default))
+        if found.primvar:
+            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
+
+    def unread(self, *names: str) -> None:
+        """Name the inputs that are authored in vain."""
+        for name in names:
+            given = value.producer(self._shader.GetInput(name))
+            if given is not None and UsdShade.Output.IsOutput(given):
+                self.warn(f"{name} is not rendered ({{n}} materials)")
 
     def number(self, name: str, default: float) -> float:
         """A number; the mean where it comes from an image."""
@@ -175,6 +188,7 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
         inputs.warn("partial opacity lets a share of the light through, straight on ({n} materials)")
+    inputs.unread("normal", "displacement", "geometry_normal")
     network = inputs.network
     textured = opacity.place is not None and not opaque
     material = Material(
