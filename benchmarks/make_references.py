@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_ir as ir
-from warp_ir.scene import Camera, Light, LightKind, Mesh, Projection, Scene
+from warp_ir.scene import Camera, Light, LightKind, Mesh, Projection, Scene, Texture, Wrap
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = Path(__file__).resolve().parent / "references"
@@ -81,6 +81,13 @@ def _rgb(color) -> dict:
     return {"type": "rgb", "value": [float(c) for c in color]}
 
 
+def _bitmap(mi, texture: Texture) -> dict:
+    """An image as Mitsuba wants it."""
+    wrap = {Wrap.CLAMP: "clamp", Wrap.REPEAT: "repeat", Wrap.MIRROR: "mirror"}[texture.wrap[0]]
+    pixels = np.broadcast_to(texture.pixels, (*texture.pixels.shape[:2], 3)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": wrap}
+
+
 def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
     """The triangles of `mesh` that have material `index`, as a Mitsuba mesh with unshared corners."""
     chosen = mesh.material == index
@@ -92,7 +99,11 @@ def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
     coloured = mesh.colors is not None
 
     properties = mi.Properties()
-    reflectance = {"type": "mesh_attribute", "name": "vertex_color"} if coloured else _rgb(material.albedo)
+    texture = material.albedo_texture
+    if texture is not None:
+        reflectance = _bitmap(mi, texture)
+    else:
+        reflectance = {"type": "mesh_attribute", "name": "vertex_color"} if coloured else _rgb(material.albedo)
     bsdf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
     properties["bsdf"] = mi.load_dict(bsdf)
     if emissive:
@@ -100,7 +111,14 @@ def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
     properties["face_normals"] = not smooth
 
     triangles = mesh.triangles[chosen]
-    result = mi.Mesh(mesh.name, triangles.size, len(triangles), has_vertex_normals=smooth, props=properties)
+    result = mi.Mesh(
+        mesh.name,
+        triangles.size,
+        len(triangles),
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=texture is not None,
+        props=properties,
+    )
     if coloured:
         result.add_attribute("vertex_color", 3, mesh.colors[chosen].ravel().astype(np.float32))
     parameters = mi.traverse(result)
@@ -108,6 +126,10 @@ def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
     parameters["faces"] = np.arange(triangles.size, dtype=np.uint32)
     if smooth:
         parameters["vertex_normals"] = mesh.normals[chosen].ravel().astype(np.float32)
+    if texture is not None:
+        uvs = mesh.uvs[texture.uv][chosen] @ texture.transform[:, :2].T + texture.transform[:, 2]
+        # Mitsuba's v runs down the image.
+        parameters["vertex_texcoords"] = (uvs * [1, -1] + [0, 1]).ravel().astype(np.float32)
     parameters.update()
     return result
 

@@ -15,11 +15,11 @@ PACKAGE = Path(ir.__file__).parent
 # Lowest first: a module may import from its own layer's left and from the layers before it.
 LAYERS = [
     ["scene"],
-    ["settings", "tonemap", "metrics", "denoise"],
+    ["settings", "tonemap", "metrics", "denoise", "mipmap"],
     ["profiling"],
     ["launch"],
     ["sampling"],
-    ["procedural", "usd", "bvh"],
+    ["procedural", "usd", "bvh", "texture"],
     ["device_scene"],
     ["surface"],
     ["lights"],

@@ -100,14 +100,16 @@ def test_the_specular_workflow_adds_its_reflection(tmp_path):
 
 @pytest.mark.parametrize(
     ("opacity", "threshold", "present", "noted"),
-    [(1, 0, True, False), (0, 0, False, False), (0.6, 0, True, True), (0.4, 0, False, True), (0.6, 0.7, False, False),
+    [(1, 0, True, False), (0, 0, False, False), (0.6, 0, True, True), (0.4, 0, True, True), (0.6, 0.7, False, False),
      (0.6, 0.6, True, False)],
 )  # fmt: skip
 def test_opacity_cuts(tmp_path, opacity, threshold, present, noted):
-    """Below its threshold a surface is absent; without one, partial opacity is cut at one half, and said."""
+    """Below its threshold a surface is absent; without one, partial opacity lets its share of light through: said."""
     text = f"float inputs:opacity = {opacity}\n float inputs:opacityThreshold = {threshold}"
     scene = load(tmp_path, material_text(text) + BOUND)
     assert bool(scene.meshes) == present and warned(scene, "/A", "opacity") == noted
+    if present:
+        assert only_material(scene).opacity == (np.float32(opacity) if noted else 1.0)
 
 
 @pytest.mark.parametrize(
@@ -134,10 +136,10 @@ def test_emission_is_finite_and_not_negative(tmp_path, value, emission):
 
 
 @pytest.mark.parametrize(
-    ("fallback", "albedo"), [("", (0.18,) * 3), ("float4 inputs:fallback = (0.5, 0.25, 0, 1)", (0.5, 0.25, 0.0))]
+    ("fallback", "albedo"), [("", (0.0,) * 3), ("float4 inputs:fallback = (0.5, 0.25, 0, 1)", (0.5, 0.25, 0.0))]
 )
 def test_textures_are_replaced_by_their_fallback(tmp_path, fallback, albedo):
-    """A textured input takes the texture's fallback, or grey; the material is named."""
+    """A texture without a file is its fallback, in the schema black; the material is named."""
     text = f"""color3f inputs:diffuseColor.connect = </A/T.outputs:rgb>
         token outputs:surface
     }}
@@ -147,7 +149,7 @@ def test_textures_are_replaced_by_their_fallback(tmp_path, fallback, albedo):
         float3 outputs:rgb"""
     text = material_text(text).replace("\n        token outputs:surface\n    }\n}", "\n    }\n}")
     scene = load(tmp_path, text + BOUND)
-    assert only_material(scene).albedo == albedo and warned(scene, "/A", "textures", "diffuseColor")
+    assert only_material(scene).albedo == albedo and warned(scene, "/A", "no image file", "fallback")
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from warp_ir.scene import Mesh as Mesh
     from warp_ir.scene import Projection as Projection
     from warp_ir.scene import Scene as Scene
+    from warp_ir.scene import Texture as Texture
+    from warp_ir.scene import Wrap as Wrap
     from warp_ir.settings import RenderSettings as RenderSettings
     from warp_ir.usd import StageReader as StageReader
     from warp_ir.usd import load_usd as load_usd
@@ -34,6 +36,8 @@ _HOME = {
     "Mesh": "scene",
     "Projection": "scene",
     "Scene": "scene",
+    "Texture": "scene",
+    "Wrap": "scene",
     "RenderSettings": "settings",
     "load_usd": "usd",
     "StageReader": "usd",

@@ -17,15 +17,29 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.bvh import Bvh, build_bvh
 from warp_ir.launch import Launcher
-from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Projection, Scene
+from warp_ir.scene import Camera, InputError, Light, LightKind, Material, Mesh, Projection, Scene, Texture
 from warp_ir.settings import RenderSettings
+from warp_ir.texture import TextureTable, mean_on_triangles, upload_textures
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_TRIANGLES = 200_000_000
 """Above this a scene is refused before anything is allocated (~200 bytes a triangle)."""
+_PATCHES = 2**14
+"""Where light is reflected, textures are means over as many patches of the scene's surface: VPLs are no denser."""
+_LARGEST_UV = 1.0e6
+"""Texture coordinates beyond are clamped: floats have no digits left for them."""
 _TRIANGLE_EMITTER = len(LightKind)
 """Kind of an emitter that is a triangle of an emissive mesh; the kinds below it are `LightKind`'s."""
+
+
+@wp.struct
+class Patterns:
+    """The textures, and where they lie."""
+
+    textures: TextureTable
+    triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
+    corner_uvs: wp.array[wp.vec2]
 
 
 @wp.struct
@@ -44,6 +58,15 @@ class SceneData:
     corner_colors: wp.array[wp.vec3]
     albedo: wp.array[wp.vec3]  # [materials]
     emission: wp.array[wp.vec3]  # [materials] radiance
+    opacity: wp.array[wp.float32]  # [materials]
+    cutoff: wp.array[wp.float32]  # [materials], absent below it; 0: present at random
+    albedo_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
+    emission_texture: wp.array[wp.int32]
+    opacity_texture: wp.array[wp.int32]
+    texture_count: int
+    patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
+    open_count: int  # materials whose opacity is below 1 anywhere
+    footprint: float  # width of the patch that a reflection of light stands for
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
     radius: float  # of a sphere around the origin that holds all surfaces
 
@@ -66,6 +89,7 @@ class SceneData:
     shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
 
     sobol: wp.array[wp.uint32]
+    address: wp.uint64  # of a copy of this record on the device: what is called seldom takes no more than this
 
 
 @wp.struct
@@ -186,22 +210,27 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
     if surfaces is not None:
         for name in SceneData.vars:
             setattr(data, name, getattr(surfaces.data, name))
+    area = scene.area() * scale**2
+    data.footprint = math.sqrt(area / _PATCHES)
     data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
     mesh = surfaces.keep[0] if surfaces is not None else _upload_surfaces(scene, frame, data, launcher)
     shapes = _upload_lights(scene.lights, frame, data, launcher)
     _upload_emitters(scene, frame, data, launcher)
     data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+    itself = launcher.array([data], SceneData)
+    data.address = wp.uint64(itself.ptr)
     colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
     used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
+    colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
     return DeviceScene(
         data=data,
         frame=frame,
         extent=extent * scale if extent > 0.0 else 1.0,
-        area=scene.area() * scale**2,
+        area=area,
         mean_albedo=scene.mean_albedo(),
         max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
         emits=data.emitter_count > 0,
-        keep=(mesh, shapes),
+        keep=(mesh, shapes, itself),
         source=scene,
     )
 
@@ -264,6 +293,7 @@ def _check(scene: Scene, checked: Collection[int]) -> None:
         if len(mesh.triangles) and not 0 <= mesh.material.min() <= mesh.material.max() < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     for material in scene.materials:
+        _check_material(material)
         if not all(0.0 <= a <= 1.0 for a in material.albedo):
             raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
         if not all(0.0 <= e < np.inf for e in material.emission):
@@ -273,6 +303,28 @@ def _check(scene: Scene, checked: Collection[int]) -> None:
             raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
         if light.world_from_light.shape != (4, 4) or not np.isfinite(light.world_from_light).all():
             raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
+
+
+def _check_material(material: Material) -> None:
+    def demand(good: Any, what: str) -> None:
+        if not good:
+            raise InputError(f"{material.name}: {what}")
+
+    demand(0.0 <= material.opacity <= 1.0 and 0.0 <= material.cutoff <= 1.0, "opacity and cutoff must lie in [0, 1]")
+    for texture in material.textures:
+        pixels = texture.pixels
+        shaped = pixels.ndim == 3 and min(pixels.shape) >= 1 and pixels.shape[2] in (1, 3)
+        demand(shaped, f"texture {texture.name}: pixels must have shape [h, w, 3] or [h, w, 1]")
+        demand(
+            np.isfinite(pixels).all() and pixels.min() >= 0.0, f"texture {texture.name}: pixels must be finite, >= 0"
+        )
+        placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
+        demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
+        demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")
+    for bounded in (material.albedo_texture, material.opacity_texture):
+        if bounded is not None:
+            top = max(bounded.pixels.max(), *bounded.outside)
+            demand(top <= 1.0 and min(bounded.outside) >= 0.0, f"texture {bounded.name}: values must lie in [0, 1]")
 
 
 def _check_mesh(mesh: Mesh) -> None:
@@ -295,12 +347,15 @@ def _check_mesh(mesh: Mesh) -> None:
         if corners is not None:
             demand(corners.shape == (count, 3, 3), f"{name} must have shape [m, 3, 3]")
             demand(np.isfinite(corners).all(), f"{name} must be finite")
+    for name, corners in mesh.uvs.items():
+        demand(corners.shape == (count, 3, 2), f"uvs {name!r} must have shape [m, 3, 2]")
+        demand(np.isfinite(corners).all(), f"uvs {name!r} must be finite")
     if mesh.colors is not None and count:
         demand(mesh.colors.min() >= 0.0 and mesh.colors.max() <= 1.0, "colors must lie in [0, 1]")
 
 
 def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
-    """Fills the geometry and material tables; returns the BVH's owner."""
+    """Fills the geometry and material tables; returns the owners of what they refer to by address."""
     meshes = [m for m in scene.meshes if len(m.triangles)]
     data.triangle_count = sum(len(m.triangles) for m in meshes)
     if meshes:
@@ -324,24 +379,59 @@ def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     )
     data.triangle_normals, data.corner_normals = _upload_corners([m.normals for m in meshes], counts, launcher)
     data.triangle_colors, data.corner_colors = _upload_corners([m.colors for m in meshes], counts, launcher)
-    data.albedo = launcher.array([m.albedo for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
-    data.emission = launcher.array([m.emission for m in scene.materials] or [(0.0, 0.0, 0.0)], wp.vec3)
+    patterns = _upload_materials(scene.materials or (Material(),), meshes, counts, data, launcher)
     data.bvh, owner = build_bvh(data.points, data.indices, launcher)
-    return owner
+    return owner, patterns
 
 
-def _upload_corners(corners: list[Any], counts: list[int], launcher: Launcher) -> tuple[Any, Any]:
+def _upload_materials(
+    materials: tuple[Material, ...], meshes: list[Mesh], counts: list[int], data: Any, launcher: Launcher
+) -> Any:
+    """Fills the tables of materials and textures, and the uv sets that the textures use; returns their owner."""
+    textures = list(dict.fromkeys(texture for material in materials for texture in material.textures))
+    row: dict[Texture | None, int] = {texture: k for k, texture in enumerate(textures)} | {None: -1}
+    uv_sets = list(dict.fromkeys(texture.uv for texture in textures))
+    data.albedo = launcher.array([m.albedo for m in materials], wp.vec3)
+    data.emission = launcher.array([m.emission for m in materials], wp.vec3)
+    data.opacity = launcher.array([m.opacity for m in materials], wp.float32)
+    data.cutoff = launcher.array([m.cutoff for m in materials], wp.float32)
+    data.albedo_texture = launcher.array([row[m.albedo_texture] for m in materials], wp.int32)
+    data.emission_texture = launcher.array([row[m.emission_texture] for m in materials], wp.int32)
+    data.opacity_texture = launcher.array([row[m.opacity_texture] for m in materials], wp.int32)
+    data.open_count = sum(m.opacity < 1.0 for m in materials)
+    data.texture_count = len(textures)
+    patterns = Patterns()
+    patterns.textures = upload_textures(textures, uv_sets, launcher)
+    corners: list[Any] = []
+    for mesh in meshes:
+        sets = [mesh.uvs.get(name) for name in uv_sets]
+        if all(s is None for s in sets):
+            corners.append(None)
+        else:
+            zero = np.zeros((len(mesh.triangles), 3, 2), np.float32)
+            chosen = np.stack([zero if s is None else s for s in sets], axis=1)
+            corners.append(np.asarray(chosen, np.float32).clip(-_LARGEST_UV, _LARGEST_UV))
+    rows = 3 * max(len(uv_sets), 1)
+    patterns.triangle_uvs, patterns.corner_uvs = _upload_corners(corners, counts, launcher, wp.vec2, rows)
+    data.patterns = launcher.array([patterns], Patterns)
+    return patterns
+
+
+def _upload_corners(
+    corners: list[Any], counts: list[int], launcher: Launcher, dtype: Any = wp.vec3, per_triangle: int = 3
+) -> tuple[Any, Any]:
     """Per-triangle offsets (-1: none) into one table of the corner values of the meshes that have them."""
+    columns = wp.types.type_size(dtype)
     rows = np.full(max(sum(counts), 1), -1, np.int32)
     values, triangle, row = [], 0, 0
     for corner, count in zip(corners, counts, strict=True):
         if corner is not None:
-            rows[triangle : triangle + count] = row + 3 * np.arange(count)
-            values.append(corner.reshape(-1, 3))
-            row += 3 * count
+            rows[triangle : triangle + count] = row + per_triangle * np.arange(count)
+            values.append(corner.reshape(-1, columns))
+            row += per_triangle * count
         triangle += count
-    table = np.concatenate(values) if values else np.zeros((1, 3))
-    return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), wp.vec3)
+    table = np.concatenate(values) if values else np.zeros((1, columns))
+    return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), dtype)
 
 
 def _upload_lights(lights: tuple[Light, ...], frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
@@ -432,7 +522,7 @@ def _upload_emitters(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
             sides = 2.0 if mesh.double_sided else 1.0
             kinds.append(np.full(len(glowing), _TRIANGLE_EMITTER, np.int32))
             items.append((first + glowing).astype(np.int32))
-            powers.append(math.pi * sides * area * emission[mesh.material[glowing]])
+            powers.append(math.pi * sides * area * _mean_emission(scene, mesh, glowing, area, data.footprint))
         first += len(mesh.triangles)
 
     kind, item, power = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers))
@@ -453,6 +543,21 @@ def _upload_emitters(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     triangle_emitter = np.full(data.triangle_count if (~analytic).any() else 1, -1, np.int32)
     triangle_emitter[item[~analytic].astype(np.int64)] = emitter[~analytic]
     data.triangle_emitter = launcher.array(triangle_emitter, wp.int32)
+
+
+def _mean_emission(scene: Scene, mesh: Mesh, triangles: Any, areas: Any, footprint: float) -> Any:
+    """Emitted radiance of triangles, mean of the channels: roughly where it is textured, but nowhere 0 in error."""
+    out = np.zeros(len(triangles))
+    for k in np.unique(mesh.material[triangles]):
+        material, chosen = scene.materials[k], mesh.material[triangles] == k
+        texture = material.emission_texture
+        if texture is None:
+            out[chosen] = np.mean(material.emission)
+        else:
+            uvs = mesh.uvs.get(texture.uv, np.zeros((len(mesh.triangles), 3, 2)))[triangles[chosen]]
+            uvs = uvs.clip(-_LARGEST_UV, _LARGEST_UV)
+            out[chosen] = mean_on_triangles(texture, uvs, areas[chosen], footprint)
+    return out
 
 
 def _power_per_radiance(light: Light, axes: Any, radius: float) -> float:

@@ -100,9 +100,11 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         if wp.length_sq(rise) > 0.0:
             sight.position += rise
             sight.normal = sight.shading_normal
-        sight.albedo = albedo(scene, hit)
-        sight.emission = emission(scene, hit)
         sight.depth = hit.t + camera.near
+        pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
+        pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
+        sight.albedo = albedo(scene, hit, pixel)
+        sight.emission = emission(scene, hit, pixel)
         reach = hit.t
     if camera.shows_lights == 1:
         length = wp.length(ray.direction)

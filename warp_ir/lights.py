@@ -10,7 +10,7 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import _TRIANGLE_EMITTER, SceneData
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, offset
+from warp_ir.surface import Hit, emitted, offset, presence
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,12 +76,18 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
         sides = 2.0
         n = wp.where(rest < 0.5, n, -n)
     root = wp.sqrt(u[0])
-    p = offset(a, b, c, 1.0 - root, root * (1.0 - u[1]), n)
+    at_a = 1.0 - root
+    at_b = root * (1.0 - u[1])
+    p = offset(a, b, c, at_a, at_b, n)
+    area = 0.5 * wp.length(cross)
     out = LightPoint()
-    out.density = probability / (0.5 * wp.length(cross) * sides)
+    out.density = probability / (area * sides)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
-    out.intensity = scene.emission[scene.triangle_material[triangle]] / out.density
+    radiance = emitted(scene, triangle, at_a, at_b, area, scene.footprint)
+    if scene.open_count > 0:
+        radiance = radiance * presence(scene, triangle, at_a, at_b)
+    out.intensity = radiance / out.density
     return out
 
 

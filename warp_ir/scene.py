@@ -52,9 +52,42 @@ class Projection(IntEnum):
     ORTHOGRAPHIC = 1
 
 
+class Wrap(IntEnum):
+    """What a `Texture` is beyond its edges."""
+
+    BLACK = 0  # the value `outside`
+    CLAMP = 1
+    REPEAT = 2
+    MIRROR = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image on surfaces."""
+
+    name: str
+    """The asset, or any label for messages."""
+    pixels: Floats
+    """float [h, w, 3] or [h, w, 1], linear, row 0 at the top: the values that the material has, nothing left to do."""
+    wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
+    """In the directions of s and t."""
+    outside: Color = (0.0, 0.0, 0.0)
+    """The value beyond the edges where `wrap` is BLACK."""
+    uv: str = "st"
+    """Which of `Mesh.uvs` it is placed by; (0, 0) where a mesh does not have it."""
+    transform: Floats = field(default_factory=lambda: np.eye(2, 3))
+    """float64 [2, 3], s and t from (u, v, 1). (0, 0) is the image's lower left corner, (1, 1) its upper right."""
+
+    @property
+    def mean(self) -> Color:
+        """Mean of the pixels; grey where there is one channel."""
+        red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
+        return red, green, blue
+
+
 @dataclass(frozen=True)
 class Material:
-    """A Lambertian surface that may emit."""
+    """A Lambertian surface that may emit. Where a texture is given, its mean replaces the value beside it."""
 
     name: str = ""
     """Prim path, or any label for messages."""
@@ -62,6 +95,27 @@ class Material:
     """Hemispherical reflectance ρ per channel, in [0, 1]."""
     emission: Color = (0.0, 0.0, 0.0)
     """Emitted radiance [W sr⁻¹ m⁻²], the same in all directions of the emitting side."""
+    opacity: float = 1.0
+    """In [0, 1]: see `cutoff`."""
+    cutoff: float = 0.0
+    """The surface is absent where the opacity is less; 0: it is there for that share of the rays."""
+    albedo_texture: Texture | None = None
+    emission_texture: Texture | None = None
+    opacity_texture: Texture | None = None
+
+    def __post_init__(self) -> None:
+        if self.albedo_texture is not None:
+            object.__setattr__(self, "albedo", self.albedo_texture.mean)
+        if self.emission_texture is not None:
+            object.__setattr__(self, "emission", self.emission_texture.mean)
+        if self.opacity_texture is not None:
+            object.__setattr__(self, "opacity", self.opacity_texture.mean[0])
+
+    @property
+    def textures(self) -> tuple[Texture, ...]:
+        """Those it has."""
+        found = (self.albedo_texture, self.emission_texture, self.opacity_texture)
+        return tuple(texture for texture in found if texture is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +140,8 @@ class Mesh:
     """float32 [m, 3, 3], albedo of the triangles' corners, in place of the material's; None: the material's."""
     double_sided: bool = False
     """Whether an emissive material emits from the back as well."""
+    uvs: Mapping[str, Floats] = field(default_factory=dict)
+    """Texture coordinates of the triangles' corners by name, float32 [m, 3, 2]."""
 
 
 @dataclass(frozen=True, eq=False)

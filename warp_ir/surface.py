@@ -9,13 +9,16 @@ may stand: farther than the error, nearer than any detail a float can hold, at a
 import warp as wp
 
 from warp_ir.bvh import intersect
-from warp_ir.device_scene import SceneData
+from warp_ir.device_scene import Patterns, SceneData
+from warp_ir.sampling import hash_combine
+from warp_ir.texture import coordinates, lookup, mip_level
 
 wp.set_module_options({"enable_backward": False})
 
 _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 _MOST_PULL = wp.constant(1.0e-3)  # a needle thinner than its rounding error has no inside
 _INFINITY = wp.constant(3.0e38)
+_MOST_LAYERS = wp.constant(1024)  # open surfaces that a ray passes before it is given up
 
 
 @wp.struct
@@ -29,6 +32,7 @@ class Hit:
     position: wp.vec3  # off the surface, on the side of `normal`: where rays may start
     normal: wp.vec3  # unit geometric normal, on the side the ray came from
     front: int  # 1 if that is the side from which the triangle is wound counter-clockwise
+    area: float  # of the triangle
 
 
 @wp.func
@@ -48,8 +52,61 @@ def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp
 
 
 @wp.func
-def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
-    """The nearest surface along a ray."""
+def _uv_at(patterns: Patterns, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
+    """Texture coordinates at a point of a triangle, and the area of the triangle's image in the uv plane."""
+    row = patterns.triangle_uvs[triangle]
+    if row < 0:
+        return wp.vec3(0.0)
+    row += 3 * uv_set
+    a = patterns.corner_uvs[row]
+    b = patterns.corner_uvs[row + 1]
+    c = patterns.corner_uvs[row + 2]
+    uv = u * a + v * b + (1.0 - u - v) * c
+    ab = b - a
+    ac = c - a
+    return wp.vec3(uv[0], uv[1], 0.5 * wp.abs(ab[0] * ac[1] - ab[1] * ac[0]))
+
+
+@wp.func(inline=False)  # so that scenes without textures do not carry the code about
+def _textured(
+    patterns: wp.array[Patterns], texture: int, triangle: int, u: float, v: float, area: float, footprint: float
+) -> wp.vec3:
+    """A texture at a point of a triangle, as the mean over a patch as wide as `footprint`; 0: as sharp as it is."""
+    p = patterns[0]
+    row = p.textures.rows[texture]
+    uv = _uv_at(p, triangle, row.uv_set, u, v)
+    level = mip_level(p.textures, row, uv[2] / area, footprint)
+    return lookup(p.textures, row, coordinates(row, wp.vec2(uv[0], uv[1])), level)
+
+
+@wp.func
+def presence(scene: SceneData, triangle: int, u: float, v: float) -> float:
+    """The share of the rays that meet the surface at a point of a triangle: its opacity, or 0 or 1 with a cutoff."""
+    material = scene.triangle_material[triangle]
+    opacity = scene.opacity[material]
+    if opacity >= 1.0:
+        return 1.0
+    if scene.opacity_texture[material] >= 0:
+        opacity = _textured(scene.patterns, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
+    cutoff = scene.cutoff[material]
+    if cutoff > 0.0:
+        return wp.where(opacity < cutoff, 0.0, 1.0)
+    return opacity
+
+
+@wp.func
+def _is_open(scene: SceneData, triangle: int, u: float, v: float) -> bool:
+    """Whether a ray passes a triangle where it meets it; the same ray always does."""
+    there = presence(scene, triangle, u, v)
+    if there <= 0.0 or there >= 1.0:
+        return there <= 0.0
+    bits = hash_combine(hash_combine(wp.uint32(triangle), wp.cast(u, wp.uint32)), wp.cast(v, wp.uint32))
+    return (float(bits >> wp.uint32(8)) + 0.5) * (1.0 / 16777216.0) > there
+
+
+@wp.func
+def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest triangle along a ray, open or not."""
     hit = Hit()
     hit.triangle = -1
     found = intersect(scene.bvh, origin, direction, t_max, False)
@@ -62,20 +119,67 @@ def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float)
         a = scene.points[scene.indices[3 * hit.triangle]]
         b = scene.points[scene.indices[3 * hit.triangle + 1]]
         c = scene.points[scene.indices[3 * hit.triangle + 2]]
-        n = wp.normalize(wp.cross(b - a, c - a))
+        cross = wp.cross(b - a, c - a)
+        hit.area = 0.5 * wp.length(cross)
+        n = wp.normalize(cross)
         hit.normal = wp.where(hit.front == 1, n, -n)
         # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
         hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
     return hit
 
 
+@wp.func_native(f"""
+    wp::array_t<{SceneData.native_name}> one;
+    one.data = ({SceneData.native_name}*)address;
+    one.shape[0] = 1;
+    one.strides[0] = sizeof({SceneData.native_name});
+    one.ndim = 1;
+    return one;
+""")
+def _scene_at(address: wp.uint64) -> wp.array[SceneData]:
+    """The record at `SceneData.address`."""
+    ...
+
+
+@wp.func(inline=False)  # and by address: handing on the whole record takes it out of the registers of the caller
+def _nearest_present(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest triangle that is there where the ray meets it."""
+    scene = _scene_at(address)[0]
+    start = origin
+    passed = float(0.0)
+    for _layer in range(_MOST_LAYERS):
+        hit = _nearest(scene, start, direction, t_max - passed)
+        if hit.triangle < 0:
+            return hit
+        passed += hit.t
+        if not _is_open(scene, hit.triangle, hit.u, hit.v):
+            hit.t = passed
+            return hit
+        a = scene.points[scene.indices[3 * hit.triangle]]
+        b = scene.points[scene.indices[3 * hit.triangle + 1]]
+        c = scene.points[scene.indices[3 * hit.triangle + 2]]
+        start = offset(a, b, c, hit.u, hit.v, wp.normalize(direction) - hit.normal)
+    nothing = Hit()
+    nothing.triangle = -1
+    return nothing
+
+
+@wp.func
+def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    """The nearest surface along a ray."""
+    if scene.open_count > 0:
+        return _nearest_present(scene.address, origin, direction, t_max)
+    return _nearest(scene, origin, direction, t_max)
+
+
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
-    xyz = wp.vec3(target[0], target[1], target[2])
-    if target[3] == 0.0:
-        return intersect(scene.bvh, origin, xyz, _INFINITY, True).triangle < 0
-    return intersect(scene.bvh, origin, xyz - origin, 0.999999, True).triangle < 0
+    way = wp.vec3(target[0], target[1], target[2]) - origin * target[3]
+    reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
+    if scene.open_count > 0:
+        return _nearest_present(scene.address, origin, way, reach).triangle < 0
+    return intersect(scene.bvh, origin, way, reach, True).triangle < 0
 
 
 @wp.func
@@ -120,11 +224,17 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
 
 
 @wp.func
-def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
-    """Hemispherical reflectance ρ at a hit."""
+def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
+    """Hemispherical reflectance ρ at a hit, as the mean over a patch as wide as `footprint` where it is textured."""
+    material = scene.triangle_material[hit.triangle]
+    if scene.texture_count > 0:
+        if scene.albedo_texture[material] >= 0:
+            return _textured(
+                scene.patterns, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
+            )
     row = scene.triangle_colors[hit.triangle]
     if row < 0:
-        return scene.albedo[scene.triangle_material[hit.triangle]]
+        return scene.albedo[material]
     return (
         hit.u * scene.corner_colors[row]
         + hit.v * scene.corner_colors[row + 1]
@@ -133,8 +243,18 @@ def albedo(scene: SceneData, hit: Hit) -> wp.vec3:
 
 
 @wp.func
-def emission(scene: SceneData, hit: Hit) -> wp.vec3:
+def emitted(scene: SceneData, triangle: int, u: float, v: float, area: float, footprint: float) -> wp.vec3:
+    """Radiance [W sr⁻¹ m⁻²] that the emitting side of a triangle emits at a point, if the surface is there."""
+    material = scene.triangle_material[triangle]
+    if scene.texture_count > 0:
+        if scene.emission_texture[material] >= 0:
+            return _textured(scene.patterns, scene.emission_texture[material], triangle, u, v, area, footprint)
+    return scene.emission[material]
+
+
+@wp.func
+def emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     """Radiance [W sr⁻¹ m⁻²] that a surface emits towards the ray that hit it."""
     if hit.front == 1 or scene.emits_back[hit.triangle] == 1:
-        return scene.emission[scene.triangle_material[hit.triangle]]
+        return emitted(scene, hit.triangle, hit.u, hit.v, hit.area, footprint)
     return wp.vec3(0.0)

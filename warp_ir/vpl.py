@@ -102,7 +102,7 @@ def _trace_paths(
         hit = closest(scene, origin, direction, 3.0e38)
         if hit.triangle < 0:
             break
-        rho = albedo(scene, hit)
+        rho = albedo(scene, hit, scene.footprint)
         if settings.fractional == 1:
             if bounce >= settings.levels or i >= settings.survivors[wp.min(bounce, settings.levels - 1)]:
                 break

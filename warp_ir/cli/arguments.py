@@ -292,6 +292,18 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         default="dome",
         help="what lights a stage in which nothing emits (default: dome)",
     )
+    group.add_argument(
+        "--metals",
+        choices=("diffuse", "black"),
+        default="diffuse",
+        help="metals as diffuse surfaces of their base colour, or without it (default: diffuse)",
+    )
+    group.add_argument(
+        "--texture-wrap",
+        choices=("black", "clamp", "repeat", "mirror"),
+        default="black",
+        help="textures beyond their edges, where the stage does not say it (default: black)",
+    )
     group.add_argument("--strict", action="store_true", help="what is skipped or guessed is an error")
 
 

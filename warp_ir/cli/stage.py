@@ -18,6 +18,8 @@ def open_reader(args: argparse.Namespace) -> Any:
         purposes=None if args.purposes is None else tuple(dict.fromkeys(("default", *args.purposes))),
         complexity=args.complexity,
         default_light=args.default_light,
+        metals=args.metals,
+        texture_wrap=args.texture_wrap,
         strict=args.strict,
         render_settings=args.render_settings,
         mask=args.mask,

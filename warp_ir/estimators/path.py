@@ -88,7 +88,7 @@ def _trace_paths(
                 reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
                 seen = lights_along(scene, position, direction, reach, hit.triangle < 0, density)
                 if hit.triangle >= 0:
-                    emitted = emission(scene, hit)
+                    emitted = emission(scene, hit, scene.footprint)
                     if wp.max(emitted) > 0.0:
                         seen += emitted * surface_weight(scene, hit, direction, density)
                 found += wp.cw_mul(throughput, seen)
@@ -100,7 +100,7 @@ def _trace_paths(
             bounce += 1
             if bounce > max_bounces or hit.triangle < 0 or not above:
                 break
-            rho = albedo(scene, hit)
+            rho = albedo(scene, hit, scene.footprint)
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
             if sampling.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
                 break

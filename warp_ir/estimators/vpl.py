@@ -113,7 +113,7 @@ def _gather_pixels(
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
                 cut = 1.0 - wp.min(lights.bound / g, 1.0)
-                found += emission(scene, hit) * cut
+                found += emission(scene, hit, scene.footprint) * cut
             found = wp.cw_mul(throughput, found) * wp.pi
             if depth == 0:
                 once += found
@@ -121,7 +121,7 @@ def _gather_pixels(
                 more += found
             if cut <= 0.0:
                 break
-            throughput = wp.cw_mul(throughput, albedo(scene, hit)) * cut
+            throughput = wp.cw_mul(throughput, albedo(scene, hit, scene.footprint)) * cut
             if depth > _ROULETTE_DEPTH:
                 survival = wp.min(wp.max(throughput), 0.99)
                 if wp.frac(v[0] * 1024.0) >= survival:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Usd
 
-from warp_ir.scene import Material
+from warp_ir.scene import Floats, Material
 from warp_ir.usd import value
 from warp_ir.usd.light import Inputs, as_color, emission, warn_of_unread
 from warp_ir.usd.report import Report, Unreadable
@@ -42,11 +42,21 @@ def glow(prim: Usd.Prim, materials: list[Material], area: float, time: Usd.TimeC
         inputs.warn("materialSyncMode 'independent': the material's own glow is not shown, only the light's")
     lit = []
     for material in materials:
-        tint = np.array(material.emission)
-        if mode != "materialGlowTintsLight" or tint.max() == 0.0:
-            tint = np.ones(3)
-        red, green, blue = (radiance * tint).tolist()
-        black = mode == "noMaterialResponse"
-        albedo = (0.0, 0.0, 0.0) if black else material.albedo
-        lit.append(replace(material, name=str(prim.GetPath()), albedo=albedo, emission=(red, green, blue)))
+        material = replace(material, name=str(prim.GetPath()))
+        if mode == "noMaterialResponse":
+            material = replace(material, albedo=(0.0, 0.0, 0.0), albedo_texture=None)
+        if mode != "materialGlowTintsLight" or max(material.emission) == 0.0:
+            material = replace(material, emission=(1.0, 1.0, 1.0), emission_texture=None)
+        lit.append(_times(material, radiance))
     return lit
+
+
+def _times(material: Material, factor: Floats) -> Material:
+    """The material with its emission multiplied, float64 [3]."""
+    texture = material.emission_texture
+    if texture is None:
+        red, green, blue = (factor * material.emission).tolist()
+        return replace(material, emission=(red, green, blue))
+    red, green, blue = (factor * texture.outside).tolist()
+    pixels = np.asarray(texture.pixels, np.float32) * factor.astype(np.float32)
+    return replace(material, emission_texture=replace(texture, pixels=pixels, outside=(red, green, blue)))

@@ -12,6 +12,7 @@ from warp_ir.usd.glow import glow
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
+from warp_ir.usd.network import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Shape, cross_products, place, without_slivers
 from warp_ir.usd.skel import Skinning, sharing_key
@@ -29,6 +30,8 @@ def build_meshes(
     report: Report,
     levels: int = 0,
     shapes: _Shapes | None = None,
+    images: Images | None = None,
+    metals: str = "diffuse",
 ) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
     """All meshes in the world, one per gprim with all its copies, and the materials they use.
 
@@ -38,19 +41,21 @@ def build_meshes(
         report: Where troubles go.
         levels: How often subdivision surfaces are refined.
         shapes: Those that are known already; new ones are added.
+        images: Those that are known already, likewise.
+        metals: "diffuse" or "black".
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    return _Builder(time, report, levels, {} if shapes is None else shapes).run(sites)
+    table = MaterialTable(time, report, images, metals)
+    return _Builder(time, report, levels, table, {} if shapes is None else shapes).run(sites)
 
 
 class _Builder:
     """From gprims to meshes and the materials they use."""
 
-    def __init__(self, time: Usd.TimeCode, report: Report, levels: int, shapes: _Shapes) -> None:
-        self._time, self._report, self._levels = time, report, levels
-        self._table = MaterialTable(time, report)
+    def __init__(self, time: Usd.TimeCode, report: Report, levels: int, table: MaterialTable, shapes: _Shapes) -> None:
+        self._time, self._report, self._levels, self._table = time, report, levels, table
         self._skinning = Skinning(time, report)
         self._shapes = shapes
 
@@ -103,6 +108,11 @@ class _Builder:
             shape, look = shape.keep(present), look.keep(present)
         points, triangles, normals = place(shape, site.matrices)
         material, colors = np.tile(look.material, copies), self._colors(look, site)
+        uvs = {name: np.tile(corners, (copies, 1, 1)) for name, corners in look.uvs.items()}
+        mirrored = np.repeat(np.linalg.det(site.matrices[:, :3, :3]) < 0.0, len(shape.triangles))
+        if mirrored.any():  # `place` has turned their corners round
+            for corners in (*uvs.values(), *([] if colors is None else [colors])):
+                corners[mirrored] = corners[mirrored][:, ::-1]
         if (np.linalg.det(site.matrices[:, :3, :3]) == 0.0).any():
             # A flattened copy keeps the triangles that still have an area.
             order = np.arange(len(triangles))
@@ -110,6 +120,7 @@ class _Builder:
             triangles, material = kept.triangles, material[kept.face]
             normals = None if kept.normals is None else _or_geometric(kept.normals, points, triangles)
             colors = None if colors is None else colors[kept.face]
+            uvs = {name: corners[kept.face] for name, corners in uvs.items()}
         if len(triangles) == 0:
             return None
         if prim.HasAPI(UsdLux.LightAPI):
@@ -121,7 +132,7 @@ class _Builder:
                 colors = None  # a light that answers with no material reflects no colour either
         # Of the implicit shapes only the plane is double-sided unless it says otherwise; its schema knows.
         double_sided = value.flag(prim.GetAttribute("doubleSided"), self._time)
-        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided)
+        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs)
 
     def _colors(self, look: Look, site: Site) -> Floats | None:
         """Albedo of the corners, float32 [k m, 3, 3], where a material's alone will not do."""

@@ -15,6 +15,7 @@ from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_sh
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.motion import Motion
+from warp_ir.usd.network import Images
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
@@ -24,6 +25,9 @@ _COUNTED = (
     "meshes",
     "triangles",
     "materials",
+    "images",
+    "textures",
+    "texels",
     "lights",
     "instances",
     "native_instances",
@@ -88,6 +92,8 @@ class StageReader:
         purposes: Sequence[str] | None = None,
         complexity: str = "low",
         default_light: str = "dome",
+        metals: str = "diffuse",
+        texture_wrap: str = "black",
         strict: bool = False,
         render_settings: str | None = None,
         mask: Sequence[str] = (),
@@ -106,6 +112,9 @@ class StageReader:
             complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
                 after one, two and three levels of refinement.
             default_light: What to do if nothing emits: "dome" adds a uniform white one of radiance 1, "none" nothing.
+            metals: "diffuse" renders a metal as a diffuse surface of its base colour, "black" without its reflection.
+            texture_wrap: What textures are beyond their edges where nothing says it: "black" as the specification has
+                it, "clamp", "repeat" or "mirror".
             strict: Whether the first warning is an error.
             render_settings: Path of a RenderSettings prim; None: the one that the stage's metadata name, else the
                 first.
@@ -125,10 +134,15 @@ class StageReader:
             raise InputError(f"complexity: {complexity!r} is none of {', '.join(_LEVELS)}")
         if default_light not in ("dome", "none"):
             raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
+        if metals not in ("diffuse", "black"):
+            raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
+        if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
+            raise InputError(f"texture_wrap: '{texture_wrap}' is not one of black, clamp, repeat, mirror")
         self._camera, self._purposes, self._default_light = camera, purposes, default_light
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _LEVELS[complexity]
         self._opened = Report(self.source, strict=strict)
+        self._metals, self._images = metals, Images(self._opened, texture_wrap)
         with self._reading():
             self.stage = open_stage(
                 self.source,
@@ -238,6 +252,9 @@ class StageReader:
         stats = dict.fromkeys(_COUNTED, 0) | report.stats
         stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
         stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
+        textures = {texture for material in materials for texture in material.textures}
+        stats["textures"] = len(textures)
+        stats["texels"] = sum(texture.pixels.shape[0] * texture.pixels.shape[1] for texture in textures)
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
         scene = Scene(meshes, materials, lights, name=report.source)
         if view is None:
@@ -256,7 +273,7 @@ class StageReader:
                 getattr(moving if self._motion.moves(site.prim) else staying, name).append(site)
         if self._still is None or key != self._still.key:
             read = self._opened.part()
-            geometry = build_meshes(staying.shapes, time, read, self._levels)
+            geometry = build_meshes(staying.shapes, time, read, self._levels, images=self._images, metals=self._metals)
             lights = _lights(staying.lights, time, read)
             self._shapes.clear()
         else:
@@ -274,7 +291,7 @@ class StageReader:
         whole = still
         for some, shapes in ((rigid, self._shapes), (bending, {})):
             if some:
-                whole = _join(whole, build_meshes(some, time, report, self._levels, shapes))
+                whole = _join(whole, build_meshes(some, time, report, self._levels, shapes, self._images, self._metals))
         return whole
 
 

@@ -1,13 +1,14 @@
 """Which material each face has: bindings, subsets and displayColor, gathered into one table without doubles."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from warp_ir.scene import Floats, Ints, Material
 from warp_ir.usd import primvar, value
+from warp_ir.usd.network import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape
 from warp_ir.usd.surface import read_material
@@ -28,11 +29,14 @@ class Look:
     """float32 [m, 3, 3], albedo of the corners where one per triangle is not enough; None elsewhere."""
     bare: Mask | None = None
     """bool [m], triangles with neither material nor colour, that an instancer may still colour; None: none."""
+    uvs: Mapping[str, Floats] = field(default_factory=dict)
+    """float32 [m, 3, 2], the texture coordinates that the materials need, by name."""
 
     def keep(self, mask: Mask) -> "Look":
         """The look of the triangles that a mask [m] selects."""
         colors = None if self.colors is None else self.colors[mask]
-        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask])
+        uvs = {name: corners[mask] for name, corners in self.uvs.items()}
+        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask], uvs)
 
 
 class MaterialTable:
@@ -41,11 +45,18 @@ class MaterialTable:
     Args:
         time: Of the values.
         report: Where troubles go.
+        images: Those that are known already; None: none are.
+        metals: "diffuse" or "black".
     """
 
-    def __init__(self, time: Usd.TimeCode, report: Report) -> None:
+    def __init__(
+        self, time: Usd.TimeCode, report: Report, images: Images | None = None, metals: str = "diffuse"
+    ) -> None:
         self.materials: list[Material] = []
         self._time, self._report = time, report
+        self._images, self._black_metals = images or Images(report), metals == "black"
+        self._images.report = report
+        self._primvars: dict[int, str] = {}
         self._known: dict[Material, int] = {}
         self._read: dict[Sdf.Path, int] = {}
         self._bound: dict[Sdf.Path, int] = {}
@@ -78,9 +89,39 @@ class MaterialTable:
         index = np.full(len(shape.triangles), self._bound.get(prim.GetPath(), UNBOUND), dtype=np.int32)
         for faces, bound in self._subsets(prim, shape):
             index[faces[shape.face]] = bound
+        return replace(self._colored(prim, shape, index), uvs=self._uvs(prim, shape, index))
+
+    def _colored(self, prim: Usd.Prim, shape: Shape, index: Ints) -> Look:
+        """The look of triangles with a material each: displayColor where there is none, primvars where it asks."""
         bare = index == UNBOUND
-        if not bare.any():
+        asked = {int(k): self._primvars[k] for k in np.unique(index) if k in self._primvars}
+        if not bare.any() and not asked:
             return Look(index)
+        colors: Floats | None = None
+        for k, name in asked.items():
+            color = primvar.display_color(prim, shape, self._time, self._report, name)
+            if color is None:
+                continue
+            chosen = index == k
+            if color.ndim == 1:
+                red, green, blue = color.tolist()
+                index[chosen] = self.add(replace(self.materials[k], albedo=(red, green, blue)))
+            else:
+                colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
+                colors[chosen] = color[chosen]
+        if not bare.any():
+            return Look(index, colors)
+        look = self._bare(prim, shape, index, bare)
+        if colors is None:
+            return look
+        chosen = bare if look.colors is not None else np.zeros_like(bare)
+        colors[bare] = self.albedo(look.material)[bare, None]
+        return replace(
+            look, colors=colors if look.colors is None else np.where(chosen[:, None, None], look.colors, colors)
+        )
+
+    def _bare(self, prim: Usd.Prim, shape: Shape, index: Ints, bare: Mask) -> Look:
+        """The look of a prim of whose triangles some have no material."""
         color = primvar.display_color(prim, shape, self._time, self._report)
         if color is None:
             index[bare] = self.add(Material("no material"))
@@ -92,6 +133,17 @@ class MaterialTable:
         index[bare] = self.add(Material("displayColor"))
         colors = np.where(bare[:, None, None], color.astype(np.float32), self.albedo(index)[:, None])
         return Look(index, colors)
+
+    def _uvs(self, prim: Usd.Prim, shape: Shape, index: Ints) -> dict[str, Floats]:
+        """The texture coordinates that a prim's materials need, and that it has."""
+        used = (self.materials[k] for k in np.unique(index[index >= 0]))
+        names = dict.fromkeys(texture.uv for material in used for texture in material.textures)
+        uvs = {}
+        for name in names:
+            corners = primvar.texture_coordinates(prim, shape, name, self._time, self._report)
+            if corners is not None:
+                uvs[name] = corners
+        return uvs
 
     def albedo(self, index: Ints) -> Floats:
         """The albedo of each material in a list of indices [m], float32 [m, 3]; ABSENT gets any."""
@@ -134,8 +186,10 @@ class MaterialTable:
         path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
         if path not in self._read:
             try:
-                read = read_material(material, self._time, self._report)
-                self._read[path] = ABSENT if read is None else self.add(read)
+                read = read_material(material, self._time, self._images, black_metals=self._black_metals)
+                self._read[path] = ABSENT if read is None else self.add(read.material)
+                if read is not None and read.primvar:
+                    self._primvars[self._read[path]] = read.primvar
             except Unreadable as trouble:
                 self._report.warn(material.GetPath(), str(trouble))
                 self._read[path] = UNBOUND

@@ -46,17 +46,20 @@ def expand(shape: Shape, values: Floats, interpolation: str, indices: Ints | Non
     return values[shape.triangles]
 
 
-def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Floats | None:
+def display_color(
+    prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report, name: str = "displayColor"
+) -> Floats | None:
     """The prim's own or inherited displayColor: float64 [3] if it is one colour, [m, 3, 3] if not, None if unset.
 
     A primvar with a wrong number of values is reduced to its first value, and named; so is a displayOpacity below 1.
+    `name` is that of another primvar to be read likewise.
     """
     opacity = np.asarray(
         value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
     )
     if opacity.dtype.kind == "f" and (opacity < 1.0).any():
         report.warn(prim.GetPath(), "displayOpacity is not honoured: it is drawn opaque ({n} in all)")
-    found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+    found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
     if not found or not found.HasValue():
         return None
     try:
@@ -66,20 +69,42 @@ def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Repo
         values = value.to_linear_rec709(found.GetAttr(), values)
         indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None
     except Unreadable as trouble:
-        report.warn(prim.GetPath(), f"{trouble}; displayColor ignored")
+        report.warn(prim.GetPath(), f"{trouble}; {name} ignored")
         return None
     if not np.isfinite(values).all():
-        report.warn(prim.GetPath(), "displayColor has values that are not finite, taken as 0")
+        report.warn(prim.GetPath(), f"{name} has values that are not finite, taken as 0")
         values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
     if values.min() < 0.0 or values.max() > 1.0:
-        report.warn(prim.GetPath(), "displayColor outside [0, 1] clamped")
+        report.warn(prim.GetPath(), f"{name} outside [0, 1] clamped")
         values = values.clip(0.0, 1.0)
     try:
         colors = expand(shape, values, found.GetInterpolation(), indices)
     except Unreadable as trouble:
-        report.warn(prim.GetPath(), f"displayColor: {trouble}; its first value is used throughout")
+        report.warn(prim.GetPath(), f"{name}: {trouble}; its first value is used throughout")
         colors = values[:1, None]
     if len(colors) == 0 or (colors == colors[0, 0]).all():
         first: Floats = colors[0, 0] if len(colors) else values[0]
         return first
     return colors
+
+
+def texture_coordinates(prim: Usd.Prim, shape: Shape, name: str, time: Usd.TimeCode, report: Report) -> Floats | None:
+    """The prim's own or inherited uv set, float32 [m, 3, 2]; None, and named, where there is none that can be used."""
+    found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+    if not found or not found.HasValue():
+        report.warn(prim.GetPath(), f"no primvar '{name}' to place textures by: one point of them is shown")
+        return None
+    try:
+        size = np.shape(value.raw(found.GetAttr(), time))[-1:]
+        values = value.floats(found.GetAttr(), time, 3 if size == (3,) else 2)
+        indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None
+        if values is None or len(values) == 0:
+            raise Unreadable(f"{name} is empty")
+        corners = expand(shape, values[:, :2], found.GetInterpolation(), indices)
+    except Unreadable as trouble:
+        report.warn(prim.GetPath(), f"{name}: {trouble}; one point of the textures is shown")
+        return None
+    if not np.isfinite(corners).all():
+        report.warn(prim.GetPath(), f"{name} has values that are not finite, taken as 0")
+    largest = float(np.finfo(np.float32).max)
+    return np.nan_to_num(corners, nan=0.0, posinf=0.0, neginf=0.0).clip(-largest, largest).astype(np.float32)

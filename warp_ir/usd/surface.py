@@ -1,26 +1,46 @@
 """Surface shaders as the renderer's diffuse, emissive `Material`: UsdPreviewSurface and inline MaterialX.
 
 A metal, or the mirror part of a specular workflow, becomes a diffuse surface of the same hemispherical albedo.
-The few percent that a dielectric coating takes from the diffuse light below it are left out.
+The few percent that a dielectric coating takes from the diffuse light below it are left out. Partial opacity lets
+that share of the rays through, straight on; emission is lost with it.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from pxr import Usd, UsdShade
 
-from warp_ir.scene import Color, Material
+from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
 from warp_ir.usd.light import BRIGHTEST
-from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.network import Images, Network, Signal, as_color, combine, constant
+from warp_ir.usd.report import Unreadable
 
 _GREY: Color = (0.18, 0.18, 0.18)
 _BLACK: Color = (0.0, 0.0, 0.0)
 _WHITE: Color = (1.0, 1.0, 1.0)
 
 
-def read_material(material: UsdShade.Material, time: Usd.TimeCode, report: Report) -> Material | None:
+@dataclass(frozen=True)
+class Surface:
+    """What a material looks like."""
+
+    material: Material
+    primvar: str = ""
+    """Where surfaces have a primvar of this name, it is their albedo."""
+
+
+def read_material(
+    material: UsdShade.Material, time: Usd.TimeCode, images: Images, *, black_metals: bool = False
+) -> Surface | None:
     """What a bound material looks like; None if its opacity makes the surface absent.
+
+    Args:
+        material: The material.
+        time: Of the values.
+        images: Of the scene.
+        black_metals: Whether metals keep nothing but their strictly diffuse part.
 
     Raises:
         Unreadable: The material has no surface shader that is understood.
@@ -36,7 +56,7 @@ def read_material(material: UsdShade.Material, time: Usd.TimeCode, report: Repor
         identifier = UsdShade.Shader(source).GetShaderId() or "an unnamed shader"
         read = _READERS.get(identifier)
         if read is not None:
-            return read(_Inputs(shader, path, time, report))
+            return read(_Inputs(shader, Network(images, path, time), black_metals))
         known.append(identifier)
     outputs = [str(o.GetFullName()) for o in material.GetSurfaceOutputs() if o.HasConnectedSource()]
     what = f"its shader {known[0]} is not understood" if known else f"it offers only {', '.join(outputs)}"
@@ -46,106 +66,74 @@ def read_material(material: UsdShade.Material, time: Usd.TimeCode, report: Repor
 
 
 class _Inputs:
-    """A shader's inputs as constants: connections followed, textures replaced and named."""
+    """The inputs of a surface shader."""
 
-    def __init__(self, shader: UsdShade.ConnectableAPI, material: object, time: Usd.TimeCode, report: Report) -> None:
-        self._shader, self._time, self._report = shader, time, report
-        self.material = material
+    def __init__(self, shader: UsdShade.ConnectableAPI, network: Network, black_metals: bool) -> None:
+        self._shader, self.network, self.black_metals = shader, network, black_metals
+        self.warn = network.warn
 
-    def warn(self, what: str) -> None:
-        """Say something about the material."""
-        self._report.warn(self.material, what)
+    def color(self, name: str, default: Color) -> Signal:
+        """A colour."""
+        found = self.network.evaluate(self._shader.GetInput(name), constant(*default))
+        if found.primvar and name not in ("diffuseColor", "base_color"):
+            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
+        return as_color(found)
 
-    def color(self, name: str, default: Color, unread: Color = _GREY) -> Color:
-        """A colour; `unread` where it comes from a texture that has no fallback of its own."""
-        found = self._source(name)
-        if isinstance(found, Usd.Attribute):
-            try:
-                return value.color(found, self._time, default)
-            except Unreadable as trouble:
-                self.warn(f"{trouble}; the default is used")
-        elif found is not None:
-            return _color_of(found, unread)
-        return default
+    def grey(self, name: str, default: float) -> Signal:
+        """One channel."""
+        found = self.network.evaluate(self._shader.GetInput(name), constant(default))
+        if found.primvar:
+            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
+        return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
+
+    def unread(self, *names: str) -> None:
+        """Name the inputs that are authored in vain."""
+        for name in names:
+            given = value.producer(self._shader.GetInput(name))
+            if given is not None and UsdShade.Output.IsOutput(given):
+                self.warn(f"{name} is not rendered ({{n}} materials)")
 
     def number(self, name: str, default: float) -> float:
-        """A number; the default where it comes from a texture."""
-        found = self._source(name)
-        if isinstance(found, Usd.Attribute):
-            try:
-                return value.number(found, self._time, default)
-            except Unreadable as trouble:
-                self.warn(f"{trouble}; the default is used")
-        return default
-
-    def text(self, name: str, default: str) -> str:
-        """A token."""
-        found = self._source(name)
-        return value.text(found, self._time, default) if isinstance(found, Usd.Attribute) else default
-
-    def _source(self, name: str) -> Usd.Attribute | list[float] | None:
-        """The attribute that holds an input's value, or the fallback of the texture it is read from."""
-        attribute = value.producer(self._shader.GetInput(name))
-        if attribute is None or not UsdShade.Output.IsOutput(attribute):
-            return attribute
-        node = UsdShade.Shader(attribute.GetPrim())
-        identifier = node.GetShaderId() or ""
-        if identifier.startswith("ND_constant_"):
-            return value.producer(node.GetInput("value"))
-        self.warn(f"textures and primvar readers are not read yet: {name} takes a constant")
-        fallback = value.raw(value.producer(node.GetInput("fallback")), self._time)
-        if fallback is None or np.ndim(fallback) != 1 or not np.isfinite(fallback).all():
-            return []
-        channels = {"r": [0], "g": [1], "b": [2], "a": [3]}.get(attribute.GetBaseName(), [0, 1, 2])
-        return [float(fallback[c]) for c in channels if c < len(fallback)]
+        """A number; the mean where it comes from an image."""
+        return float(self.grey(name, default).mean[0])
 
 
-def _color_of(channels: list[float], unread: Color) -> Color:
-    if len(channels) == 3:
-        return channels[0], channels[1], channels[2]
-    return (channels[0],) * 3 if len(channels) == 1 else unread
+def _mean_channel(pixels: Floats) -> Floats:
+    return np.asarray(pixels[..., :3].mean(axis=-1, keepdims=True))
 
 
-def _preview_surface(inputs: _Inputs) -> Material | None:
+def _preview_surface(inputs: _Inputs) -> Surface | None:
     """UsdPreviewSurface; MaterialX's node of the same name has the same inputs."""
-    if not _is_present(inputs, inputs.number("opacity", 1.0), inputs.number("opacityThreshold", 0.0)):
-        return None
-    albedo = np.array(inputs.color("diffuseColor", _GREY))
+    albedo = inputs.color("diffuseColor", _GREY)
     if inputs.number("useSpecularWorkflow", 0.0) > 0.5:
-        specular = np.clip(inputs.color("specularColor", _BLACK, _BLACK), 0.0, 1.0)
-        albedo = albedo * (1.0 - specular) + specular
-        if specular.max() > 0.05:
+        specular = combine("clip", _unit, inputs.color("specularColor", _BLACK))
+        if specular.pixels.max() > 0.0:
+            albedo = combine("specular", lambda d, s: d * (1.0 - s) + s, albedo, specular)
+        if specular.pixels.max() > 0.05:
             inputs.warn("specular reflection rendered as diffuse ({n} materials)")
-    elif inputs.number("metallic", 0.0) > 0.0:
-        inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
-    return _material(inputs, albedo, np.array(inputs.color("emissiveColor", _BLACK, _BLACK)))
+    else:
+        albedo = _metal(inputs, "metallic", albedo)
+    emission = inputs.color("emissiveColor", _BLACK)
+    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0))
 
 
-def _standard_surface(inputs: _Inputs) -> Material | None:
+def _standard_surface(inputs: _Inputs) -> Surface | None:
     """Autodesk Standard Surface: base and emission."""
-    opacity = float(np.mean(inputs.color("opacity", _WHITE, _WHITE)))
-    if not _is_present(inputs, opacity, 0.0):
-        return None
-    if inputs.number("metalness", 0.0) > 0.0:
-        inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
     if inputs.number("transmission", 0.0) > 0.0:
         inputs.warn("transmission is not rendered: the surface is opaque")
-    albedo = inputs.number("base", 1.0) * np.array(inputs.color("base_color", (0.8, 0.8, 0.8)))
-    emission = inputs.number("emission", 0.0) * np.array(inputs.color("emission_color", _WHITE, _WHITE))
-    return _material(inputs, albedo, emission)
+    albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
+    emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
+    return _surface(inputs, _metal(inputs, "metalness", albedo), emission, inputs.grey("opacity", 1.0), 0.0)
 
 
-def _open_pbr_surface(inputs: _Inputs) -> Material | None:
+def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
     """OpenPBR: base and emission."""
-    if not _is_present(inputs, inputs.number("geometry_opacity", 1.0), 0.0):
-        return None
-    if inputs.number("base_metalness", 0.0) > 0.0:
-        inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
     if inputs.number("transmission_weight", 0.0) > 0.0:
         inputs.warn("transmission is not rendered: the surface is opaque")
-    albedo = inputs.number("base_weight", 1.0) * np.array(inputs.color("base_color", (0.8, 0.8, 0.8)))
-    luminance = inputs.number("emission_luminance", 0.0)
-    return _material(inputs, albedo, luminance * np.array(inputs.color("emission_color", _WHITE, _WHITE)))
+    albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
+    emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
+    opacity = inputs.grey("geometry_opacity", 1.0)
+    return _surface(inputs, _metal(inputs, "base_metalness", albedo), emission, opacity, 0.0)
 
 
 _READERS = {
@@ -156,31 +144,78 @@ _READERS = {
 }
 
 
-def _is_present(inputs: _Inputs, opacity: float, threshold: float) -> bool:
-    """Whether a ray meets the surface; partial opacity is cut at the threshold, or at one half without one."""
-    if threshold > 0.0:
-        return opacity >= threshold
-    if 0.0 < opacity < 1.0:
-        inputs.warn("partial opacity is cut at one half: the surface is either there or not ({n} materials)")
-    return opacity >= 0.5
+def _unit(pixels: Floats) -> Floats:
+    return np.clip(pixels, 0.0, 1.0)
 
 
-def _material(inputs: _Inputs, albedo: np.ndarray, emission: np.ndarray) -> Material:
-    """A record with an albedo that conserves energy and an emission that exists."""
-    if albedo.min() < 0.0 or albedo.max() > 1.0:
+def _scaled(color: Signal, weight: Signal) -> Signal:
+    if weight.place is None and weight.mean[0] == 1.0:
+        return color
+    return combine("scaled", np.multiply, color, weight)
+
+
+def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
+    """The albedo of a surface that may be a metal, of which only its base colour is left, or nothing."""
+    metallic = inputs.grey(name, 0.0)
+    if metallic.pixels.max() <= 0.0:
+        return albedo
+    if not inputs.black_metals:
+        inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
+        return albedo
+    inputs.warn("metal rendered without its reflection ({n} materials)")
+    return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
+
+
+def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float) -> Surface | None:
+    """A record with an albedo that conserves energy and an emission that exists; None if nothing is there."""
+    if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
-    if emission.max() >= BRIGHTEST:
+        albedo = combine("clip", _unit, albedo)
+    if float(emission.pixels.max()) >= BRIGHTEST:
         inputs.warn(f"emission {_numbers(emission)} is beyond reason; it emits nothing")
-        emission = np.zeros(3)
-    if emission.min() < 0.0:
+        emission = constant(*_BLACK)
+    if emission.pixels.min() < 0.0:
         inputs.warn(f"negative emission {_numbers(emission)} clamped to 0")
-    return Material(str(inputs.material), _rgb(albedo.clip(0.0, 1.0)), _rgb(emission.clip(0.0, math.inf)))
+        emission = combine("positive", lambda e: np.clip(e, 0.0, math.inf), emission)
+    opacity = combine("clip", _unit, opacity)
+    values = opacity.pixels.reshape(-1)
+    if opacity.place is not None and Wrap.BLACK in opacity.place.wrap:
+        values = np.append(values, opacity.outside)
+    if threshold > 0.0:
+        values = (values >= threshold).astype(np.float64)
+    if values.max() <= 0.0:
+        return None
+    opaque = values.min() >= 1.0
+    if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
+        inputs.warn("partial opacity lets a share of the light through, straight on ({n} materials)")
+    inputs.unread("normal", "displacement", "geometry_normal")
+    network = inputs.network
+    textured = opacity.place is not None and not opaque
+    material = Material(
+        str(network.material),
+        _rgb(albedo.mean),
+        _rgb(emission.mean),
+        1.0 if opaque else float(opacity.mean[0]),
+        min(threshold, 1.0) if textured else 0.0,
+        None if albedo.place is None else network.texture(_bounded(albedo)),
+        None if emission.place is None or emission.pixels.max() == 0.0 else network.texture(_bounded(emission)),
+        network.texture(_bounded(opacity)) if textured else None,
+    )
+    return Surface(material, albedo.primvar)
 
 
-def _rgb(channels: np.ndarray) -> Color:
-    red, green, blue = channels.tolist()
+def _bounded(signal: Signal) -> Signal:
+    """The signal, its value outside as positive as its pixels."""
+    top = max(float(signal.pixels.max()), 0.0)
+    return Signal(signal.pixels, np.clip(signal.outside, 0.0, max(top, 1.0)), signal.place, signal.key, signal.name)
+
+
+def _rgb(channels: Floats) -> Color:
+    red, green, blue = np.broadcast_to(channels, 3).tolist()
     return red, green, blue
 
 
-def _numbers(channels: np.ndarray) -> str:
-    return "(" + ", ".join(f"{c:g}" for c in channels) + ")"
+def _numbers(signal: Signal) -> str:
+    if signal.place is not None:
+        return f"of {signal.name}"
+    return "(" + ", ".join(f"{c:g}" for c in signal.mean) + ")"

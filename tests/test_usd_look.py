@@ -1,0 +1,389 @@
+"""Networks of shading nodes: textures in place, arithmetic on them, and what becomes of what cannot be read."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from pxr import Sdf, Usd, UsdUtils
+
+import warp_ir as ir
+from tests.test_usd_material import QUADS, load, material_text, only_material, warned
+from tests.test_usd_texture import write
+from warp_ir.scene import Wrap
+from warp_ir.usd.texture import srgb_to_linear
+
+ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
+ST = "texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0), (2, 1)] (interpolation = 'vertex')"
+RGBA = np.arange(2 * 3 * 4).reshape(2, 3, 4).astype(np.uint8) * 10
+READER = """def Shader "R" {
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }"""
+
+
+def mesh(more=ST, name="M"):
+    """Two quads with the material A and a uv set."""
+    binding = "rel material:binding = </A>"
+    return f'def Mesh "{name}" (prepend apiSchemas = ["MaterialBindingAPI"]) {{{QUADS} {more}\n {binding}\n}}\n'
+
+
+def textured(
+    inputs="", output="rgb", target="color3f inputs:diffuseColor", file="a.png", place="R.outputs:result", nodes=READER
+):
+    """A UsdPreviewSurface with a UsdUVTexture on one input."""
+    text = material_text(f"{target}.connect = </A/T.outputs:{output}>")
+    shader = f"""
+    def Shader "T" {{
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @{file}@
+        float2 inputs:st.connect = </A/{place}>
+        {inputs}
+        float3 outputs:{output}
+    }}
+    {nodes}
+"""
+    return text.rstrip()[:-1] + shader + "}\n"
+
+
+@pytest.fixture
+def image(tmp_path):
+    """a.png, of which the tests know every byte."""
+    write(tmp_path / "a.png", RGBA)
+    return RGBA / 255.0
+
+
+def test_a_texture_is_put_in_place(tmp_path, image):
+    """The image in linear light, halves; black outside unless it says otherwise; the uv set by its name."""
+    scene = load(tmp_path, textured() + mesh())
+    texture = only_material(scene).albedo_texture
+    np.testing.assert_allclose(texture.pixels, srgb_to_linear(image[..., :3]), atol=2.0**-11)
+    assert texture.wrap == (Wrap.BLACK, Wrap.BLACK) and texture.outside == (0.0, 0.0, 0.0) and texture.uv == "st"
+    assert scene.meshes[0].uvs["st"].shape == (4, 3, 2) and scene.meshes[0].uvs["st"][2:].max() == 2.0
+    assert only_material(scene).albedo == pytest.approx(srgb_to_linear(image[..., :3]).mean(axis=(0, 1)), rel=1e-3)
+    assert (scene.stats["images"], scene.stats["textures"], scene.stats["texels"]) == (1, 1, 6)
+    assert not warned(scene, "texture")
+
+
+@pytest.mark.parametrize("output, channel", [("r", 0), ("g", 1), ("b", 2), ("a", 3)])
+def test_channels_scale_and_bias(tmp_path, image, output, channel):
+    """The output is image * scale + bias, channel by channel; alpha is not decoded."""
+    text = textured(
+        """float4 inputs:scale = (0.5, 0.25, 2, 0.75)
+        float4 inputs:bias = (0.1, 0.2, 0.3, 0.05)
+        token inputs:wrapS = "mirror"
+        token inputs:wrapT = "clamp\"""",
+        output,
+    )
+    texture = only_material(load(tmp_path, text + mesh())).albedo_texture
+    stored = image[..., channel] if channel == 3 else srgb_to_linear(image[..., channel])
+    expected = stored * (0.5, 0.25, 2.0, 0.75)[channel] + (0.1, 0.2, 0.3, 0.05)[channel]
+    expected = np.repeat(expected[..., None], 3, 2).clip(0.0, 1.0)
+    np.testing.assert_allclose(texture.pixels, expected, atol=2.0**-11)
+    assert texture.wrap == (Wrap.MIRROR, Wrap.CLAMP)
+
+
+def test_beyond_the_edges_black_is_biased_too(tmp_path, image):
+    """Outside an image that is black there, scale and bias still act."""
+    text = textured("float4 inputs:bias = (0.25, 0.5, 0, 0)")
+    assert only_material(load(tmp_path, text + mesh())).albedo_texture.outside == (0.25, 0.5, 0.0)
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+def test_the_wrap_mode_that_files_forget(tmp_path, image, wrap):
+    """`texture_wrap` is what unsaid edges are."""
+    texture = only_material(load(tmp_path, textured() + mesh(), texture_wrap=wrap)).albedo_texture
+    assert texture.wrap == (Wrap[wrap.upper()],) * 2
+    said = textured('token inputs:wrapS = "black"')
+    assert only_material(load(tmp_path, said + mesh(), texture_wrap=wrap)).albedo_texture.wrap[0] == Wrap.BLACK
+
+
+@pytest.mark.parametrize(
+    "space, decoded", [("raw", False), ("sRGB", True), ("auto", True)]
+)  # fmt: skip
+def test_colour_spaces(tmp_path, image, space, decoded):
+    """The node's sourceColorSpace decides; automatic is sRGB for 8 bits in colour."""
+    texture = only_material(
+        load(tmp_path, textured(f'token inputs:sourceColorSpace = "{space}"') + mesh())
+    ).albedo_texture
+    expected = srgb_to_linear(image[..., :3]) if decoded else image[..., :3]
+    np.testing.assert_allclose(texture.pixels, expected, atol=2.0**-11)
+
+
+def test_a_linear_wide_gamut_is_converted(tmp_path):
+    """An image in ACEScg red becomes Rec.709's, negative parts cut: the colour space is the attribute's."""
+    write(tmp_path / "a.exr", np.float32([[[0.613, 0.070, 0.021]]]), oiio.FLOAT)
+    text = textured(file="a.exr").replace("@a.exr@", '@a.exr@ (colorSpace = "lin_ap1_scene")')
+    pixels = only_material(load(tmp_path, text + mesh())).albedo_texture.pixels
+    np.testing.assert_allclose(pixels[0, 0], (1.0, 0.0, 0.0), atol=2e-3)
+
+
+def test_transforms(tmp_path, image):
+    """UsdTransform2d scales, then rotates counter-clockwise, then moves: (1, 0) goes to (0, 2) + (0.25, 0.5)."""
+    nodes = (
+        READER
+        + """
+    def Shader "X" {
+        uniform token info:id = "UsdTransform2d"
+        float2 inputs:in.connect = </A/R.outputs:result>
+        float inputs:rotation = 90
+        float2 inputs:scale = (2, 3)
+        float2 inputs:translation = (0.25, 0.5)
+        float2 outputs:result
+    }"""
+    )
+    texture = only_material(load(tmp_path, textured(place="X.outputs:result", nodes=nodes) + mesh())).albedo_texture
+    np.testing.assert_allclose(texture.transform @ (1, 0, 1), (0.25, 2.5), atol=1e-12)
+    np.testing.assert_allclose(texture.transform @ (0, 1, 1), (-2.75, 0.5), atol=1e-12)
+
+
+def test_unconnected_coordinates_are_one_point(tmp_path, image):
+    """The schema's st is (0, 0), whatever the mesh has."""
+    text = textured().replace("float2 inputs:st.connect = </A/R.outputs:result>", "")
+    assert (only_material(load(tmp_path, text + mesh())).albedo_texture.transform == 0.0).all()
+
+
+@pytest.mark.parametrize("kind", ["texCoord2f", "float2", "half2", "double2", "texCoord3f"])
+@pytest.mark.parametrize("form", ["faceVarying", "indexed"])
+def test_uv_sets_of_any_type(tmp_path, image, kind, form):
+    """Face-varying, indexed, single, half or double; corners keep their values through triangulation."""
+    third = ", 9" if kind == "texCoord3f" else ""
+    pairs = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    if form == "indexed":
+        values = ", ".join(f"({u}, {v}{third})" for u, v in pairs)
+        more = f"int[] primvars:st:indices = [0, 1, 2, 3, 0, 1, 2, 3]\n {kind}[] primvars:st = [{values}]"
+    else:
+        more = f"{kind}[] primvars:st = [{', '.join(f'({u}, {v}{third})' for u, v in pairs * 2)}]"
+    scene = load(tmp_path, textured() + mesh(more + ' (interpolation = "faceVarying")'))
+    uvs = scene.meshes[0].uvs["st"]
+    points = scene.meshes[0].points[scene.meshes[0].triangles]
+    inside = points[..., :2] - np.array([1.0, 0.0]) * (points[..., :1].max(axis=1, keepdims=True) > 1.0)
+    np.testing.assert_array_equal(uvs, inside)
+
+
+def test_mirrored_instances_keep_their_texture(tmp_path, image):
+    """A mirrored copy has its corners turned round: each still has the coordinates of its point."""
+    text = textured() + mesh().replace("rel material", "double3 xformOp:scale = (-1, 1, 1)\n uniform token[] "
+                                       'xformOpOrder = ["xformOp:scale"]\n rel material')  # fmt: skip
+    scene = load(tmp_path, text)
+    points = scene.meshes[0].points[scene.meshes[0].triangles]
+    np.testing.assert_array_equal(scene.meshes[0].uvs["st"], np.abs(points[..., :2]))
+
+
+@pytest.mark.parametrize(
+    "more, word",
+    [
+        ("", "no primvar 'st'"),
+        ("texCoord2f[] primvars:st = [(0, 0)] (interpolation = 'vertex')", "are needed"),
+        ("int primvars:st = 3", "not an array"),
+        ("texCoord2f[] primvars:st = [(0, 0), (1, 0), (nan, 1), (0, 1), (inf, 0), (2, 1)] (interpolation = 'vertex')",
+         "not finite"),
+    ],
+)  # fmt: skip
+def test_bad_coordinates_are_named(tmp_path, image, more, word):
+    """The surface shows one point of the texture, or what is finite; it renders."""
+    scene = load(tmp_path, textured() + mesh(more))
+    assert warned(scene, "/M", word)
+    settings = ir.RenderSettings(width=4, height=4, iterations=1, light_paths=16)
+    assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()
+
+
+def test_udim_tiles_are_one_texture(tmp_path):
+    """Tiles 1001 and 1012 lie at (0, 0) and (1, 1); those that are missing show the fallback."""
+    for number, value in ((1001, 255), (1012, 51)):
+        write(tmp_path / f"t.{number}.png", np.full((2, 2, 3), value, np.uint8))
+    text = textured('float4 inputs:fallback = (0.5, 0.25, 0, 1)\n token inputs:sourceColorSpace = "raw"',
+                    file="./t.<UDIM>.png")  # fmt: skip
+    texture = only_material(load(tmp_path, text + mesh())).albedo_texture
+    assert texture.pixels.shape == (4, 4, 3)
+    np.testing.assert_allclose(texture.pixels[3, 0], 1.0)
+    np.testing.assert_allclose(texture.pixels[0, 3], 0.2, atol=1e-3)
+    np.testing.assert_allclose(texture.pixels[0, 0], (0.5, 0.25, 0.0))
+    np.testing.assert_allclose(texture.transform @ (1, 2, 1), (0.5, 1.0))
+
+
+def test_opacity(tmp_path, image):
+    """Alpha with a threshold cuts; without one it lets its share through. Opaque alpha costs nothing."""
+    target = "float inputs:opacity"
+    cut = textured(output="a", target=f"float inputs:opacityThreshold = 0.5\n {target}")
+    material = only_material(load(tmp_path, cut + mesh()))
+    assert material.cutoff == 0.5
+    np.testing.assert_allclose(material.opacity_texture.pixels[..., 0], image[..., 3], atol=2.0**-11)
+    scene = load(tmp_path, textured(output="a", target=target) + mesh())
+    assert only_material(scene).cutoff == 0.0 and warned(scene, "/A", "partial opacity")
+    write(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
+    repeat = 'token inputs:wrapS = "repeat"\n token inputs:wrapT = "repeat"'
+    opaque = only_material(load(tmp_path, textured(repeat, output="a", target=target) + mesh()))
+    assert opaque.opacity_texture is None and opaque.opacity == 1.0
+
+
+def test_a_textured_glow_lights_the_scene(tmp_path, image):
+    """A room whose only light is a texture needs no default dome."""
+    scene = load(tmp_path, textured(target="color3f inputs:emissiveColor") + mesh())
+    assert scene.lights == () and max(only_material(scene).emission) > 0.0
+
+
+def test_images_are_read_once_and_only_where_used(tmp_path, image):
+    """Two materials and two outputs of one file: one image; a material without a surface: none."""
+    second = textured().replace("</A", "</B").replace('"A"', '"B"')
+    unused = textured(file="lost.png").replace("</A", "</C").replace('"A"', '"C"')
+    scene = load(tmp_path, textured() + second + unused + mesh() + mesh(name="N").replace("</A>", "</B>"))
+    assert (scene.stats["images"], scene.stats["textures"]) == (1, 1) and not warned(scene, "lost")
+
+
+def test_more_pixels_than_the_budget(tmp_path, image, monkeypatch):
+    """Images are averaged down, said once, and keep their mean."""
+    monkeypatch.setattr("warp_ir.usd.network.MAX_TEXTURE_PIXELS", 8)
+    scene = load(tmp_path, textured('token inputs:sourceColorSpace = "raw"') + mesh())
+    assert scene.stats["texels"] <= 4 and warned(scene, "a.png", "averaged down")
+
+
+def test_black_metals(tmp_path):
+    """The strict diffuse lobe is diffuseColor (1 - metallic)."""
+    text = material_text("color3f inputs:diffuseColor = (1, 0.5, 0.25)\n float inputs:metallic = 0.75")
+    assert only_material(load(tmp_path, text + mesh(), metals="black")).albedo == (0.25, 0.125, 0.0625)
+    with pytest.raises(ir.InputError, match="metals"):
+        load(tmp_path, text, metals="gold")
+    with pytest.raises(ir.InputError, match="texture_wrap"):
+        load(tmp_path, text, texture_wrap="round")
+
+
+@pytest.mark.parametrize("interpolation", ["constant", "vertex"])
+def test_primvars_as_colours(tmp_path, interpolation):
+    """A diffuseColor that reads a primvar is that of the surface, and the reader's fallback where there is none."""
+    reader = """def Shader "P" {
+        uniform token info:id = "UsdPrimvarReader_float3"
+        string inputs:varname = "paint"
+        float3 inputs:fallback = (0.25, 0.5, 0.75)
+        float3 outputs:result
+    }"""
+    reader = f"\n{reader}\n"
+    text = material_text("color3f inputs:diffuseColor.connect = </A/P.outputs:result>").rstrip()[:-1] + reader + "}\n"
+    colors = [(k / 8, 0.5, 0) for k in range(6 if interpolation == "vertex" else 1)]
+    painted = mesh(f"color3f[] primvars:paint = {colors} (interpolation = '{interpolation}')")
+    scene = load(tmp_path, text + painted + mesh("", "N"))
+    one, two = scene.meshes
+    if interpolation == "vertex":
+        np.testing.assert_allclose(one.colors[..., 0], one.triangles / 8)
+    else:
+        assert one.colors is None and scene.materials[one.material[0]].albedo == (0.0, 0.5, 0.0)
+    assert scene.materials[two.material[0]].albedo == (0.25, 0.5, 0.75)
+
+
+MATERIALX = """
+    def Shader "I" {
+        uniform token info:id = "ND_%s"
+        asset inputs:file = @a.png@
+        float2 inputs:uvtiling = (2, 3)
+        float2 inputs:uvoffset = (0.5, 0)
+        color3f inputs:default = (0.5, 0.25, 0)
+        color3f outputs:out
+    }
+    def Shader "X" {
+        uniform token info:id = "ND_multiply_color3"
+        color3f inputs:in1.connect = </A/I.outputs:out>
+        color3f inputs:in2 = (0.5, 1, 0)
+        color3f outputs:out
+    }
+"""
+
+
+def materialx(node="tiledimage_color3", nodes=MATERIALX):
+    base = "color3f inputs:base_color.connect = </A/X.outputs:out>\n float inputs:base = 0.5"
+    text = material_text(base, shader="ND_standard_surface_surfaceshader", output="mtlx:surface")
+    return text.rstrip()[:-1] + (nodes % node if "%s" in nodes else nodes) + "}\n"
+
+
+@pytest.mark.parametrize("node", ["tiledimage_color3", "image_color3"])
+def test_materialx_images(tmp_path, image, node):
+    """Images, tiled or not, multiplied and weighted; tiling is uv * n - offset, and repeats."""
+    texture = only_material(load(tmp_path, materialx(node) + mesh())).albedo_texture
+    np.testing.assert_allclose(texture.pixels, srgb_to_linear(image[..., :3]) * (0.25, 0.5, 0.0), atol=2.0**-11)
+    assert texture.wrap == (Wrap.REPEAT, Wrap.REPEAT)
+    tiled = [(2, 0, -0.5), (0, 3, 0)] if node.startswith("tiled") else [(1, 0, 0), (0, 1, 0)]
+    np.testing.assert_array_equal(texture.transform, tiled)
+
+
+def test_what_is_not_understood_is_named(tmp_path, image):
+    """An unknown node, a loop of nodes and a missing file each give the default, in time."""
+    noise = MATERIALX.replace("ND_%s", "ND_cellnoise2d_float")
+    assert warned(load(tmp_path, materialx(nodes=noise) + mesh()), "/A", "ND_cellnoise2d_float", "not understood")
+    loop = MATERIALX.replace("(0.5, 1, 0)", "(1, 1, 1)").replace(
+        "inputs:in1.connect = </A/I.", "inputs:in1.connect = </A/X."
+    )
+    loop = loop.replace("color3f inputs:in2 = (1, 1, 1)", "color3f inputs:in2.connect = </A/X.outputs:out>")
+    start = time.monotonic()
+    assert warned(load(tmp_path, materialx(nodes=loop) + mesh()), "/A", "too deep")
+    assert time.monotonic() - start < 10.0
+    scene = load(tmp_path, materialx(nodes=MATERIALX.replace("a.png", "lost.png")) + mesh())
+    assert warned(scene, "/A", "lost.png", "not found") and only_material(scene).albedo == (0.125, 0.125, 0.0)
+
+
+def test_the_same_scene_in_every_kind_of_file(tmp_path, image):
+    """usda, usdc and usdz with the same texture give the same picture, bit for bit."""
+    load(tmp_path, textured() + mesh())
+    source = str(tmp_path / "stage.usda")
+    Usd.Stage.Open(source).Export(str(tmp_path / "stage.usdc"))
+    assert UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(source), str(tmp_path / "stage.usdz"))
+    settings = ir.RenderSettings(width=16, height=16, iterations=2, light_paths=64)
+    films = [
+        ir.render(ir.load_usd(tmp_path / f"stage.{kind}"), settings, device="cpu") for kind in ("usda", "usdc", "usdz")
+    ]
+    assert all((film.radiance() == films[0].radiance()).all() for film in films[1:])
+    assert films[0].aov("albedo").std() > 0.01
+
+
+@pytest.mark.parametrize(
+    "file, images",
+    [
+        ("usdwg_teapot/full_assets/Teapot/DrawModes.usd", 2),
+        ("usdwg_shaderball/full_assets/StandardShaderBall/standard_shader_ball_scene.usda", 6),
+        ("usdwg_tests/test_assets/TextureFileFormatTests/all_files.usda", 8),
+        ("usdwg_tests/test_assets/TextureTransformTest/TextureTransformTest.usd", 5),
+        ("usdwg_tests/test_assets/AlphaBlendModeTest/AlphaBlendModeTest.usd", 2),
+        ("usdwg_usdz/test_assets/USDZ/CesiumMan/CesiumMan.usdz", 1),
+    ],
+)
+def test_real_files(file, images):
+    """Files of others load with their images, and render."""
+    if not (ASSETS / file).exists():
+        pytest.skip("the files are not here")
+    scene = ir.load_usd(ASSETS / file)
+    assert scene.stats["images"] == images
+    settings = ir.RenderSettings(width=16, height=16, iterations=1, light_paths=64)
+    assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()
+
+
+def test_what_is_read_in_vain_is_named(tmp_path, image):
+    """Normal maps, and primvars where only constants and images count, are said once; unset interfaces are not."""
+    assert warned(load(tmp_path, textured(target="normal3f inputs:normal") + mesh()), "/A", "normal", "not rendered")
+    opacity = textured(target="float inputs:opacity", output="result").replace("UsdUVTexture", "UsdPrimvarReader_float")
+    opacity = opacity.replace(
+        "asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1'
+    )
+    assert warned(load(tmp_path, opacity + mesh()), "/A", "opacity", "'veil'")
+    plain = material_text("normal3f inputs:normal.connect = </A.inputs:unset>").replace(
+        "token outputs:surface.connect", "normal3f inputs:unset\n token outputs:surface.connect"
+    )
+    assert not warned(load(tmp_path, plain + mesh("")), "normal")
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        "float4 inputs:scale = (1e38, 1e38, 1e38, 1)",
+        "float4 inputs:scale = (nan, 1, 1, 1)",
+        "float4 inputs:bias = (inf, 0, 0, 0)",
+        'token inputs:wrapS = "sideways"',
+        "int inputs:sourceColorSpace = 3",
+        "float4 inputs:fallback = (nan, nan, nan, nan)",
+        "float2 inputs:st = (1e38, -1e38)",
+    ],
+)
+def test_absurd_numbers_render(tmp_path, image, inputs):
+    """Whatever a node says, the scene loads and its picture is finite."""
+    scene = load(tmp_path, textured(inputs) + mesh())
+    settings = ir.RenderSettings(width=4, height=4, iterations=1, light_paths=16)
+    assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()

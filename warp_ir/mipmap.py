@@ -1,0 +1,35 @@
+"""Images made smaller without changing their mean."""
+
+import numpy as np
+
+from warp_ir.scene import Floats
+
+
+def mip_chain(pixels: Floats) -> list[Floats]:
+    """The image [h, w, c] and ever smaller ones, down to one pixel, all of the same mean."""
+    chain = [np.asarray(pixels, np.float32)]
+    while max(chain[-1].shape[:2]) > 1:
+        height, width = (max(n // 2, 1) for n in chain[-1].shape[:2])
+        chain.append(resized(chain[-1], height, width))
+    return chain
+
+
+def resized(pixels: Floats, height: int, width: int) -> Floats:
+    """Means [height, width, c] over equal parts of an image, pixels on their borders shared in proportion."""
+    h, w = pixels.shape[:2]
+    if (h, w) == (2 * height, 2 * width):
+        quarters = pixels.reshape(height, 2, width, 2, -1)
+        return np.asarray(quarters.mean(axis=(1, 3), dtype=np.float32))
+    out = np.asarray(pixels, np.float64)
+    for axis, size in ((0, height), (1, width)):
+        count = out.shape[axis]
+        if count == size:
+            continue
+        # Differences of the integral, which is linear between the pixels' edges.
+        sums = np.concatenate([np.zeros_like(np.take(out, [0], axis)), np.cumsum(out, axis=axis)], axis=axis)
+        edges = np.arange(size + 1) * (count / size)
+        below = np.minimum(edges.astype(np.int64), count - 1)
+        rest = (edges - below).reshape([-1 if k == axis else 1 for k in range(out.ndim)])
+        integral = np.take(sums, below, axis) + rest * np.take(out, below, axis)
+        out = np.diff(integral, axis=axis) * (size / count)
+    return out.astype(np.float32)

@@ -1,0 +1,518 @@
+"""Networks of shading nodes as values: constants, images in place on a surface, or primvars.
+
+An image that is scaled, tinted or mixed with constants is again an image, so all of that is done once, here, and
+renders for nothing. Two images that lie in the same place are combined pixel by pixel; if they do not, the second
+counts as its mean.
+"""
+
+import math
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdShade
+
+from warp_ir.mipmap import resized
+from warp_ir.scene import Floats, Texture, Wrap
+from warp_ir.usd import value
+from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.texture import MAX_PIXELS, Image, read_texture
+
+MAX_TEXTURE_PIXELS = 2**27
+"""Of all images of a scene: each takes at most half of what is left."""
+_DEPTH = 32
+"""Longest chain of nodes that is followed."""
+_NODE_BUDGET = 256
+"""Most nodes that one input may need: shared nodes count every time they are used."""
+_WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
+_MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
+_SRGB_NAMES = ("srgb_texture", "srgb", "srgb_rec709_scene", "sRGB")
+_LINEAR_NAMES = {"acescg": Gf.ColorSpaceNames.LinearAP1, "lin_srgb": Gf.ColorSpaceNames.LinearRec709}
+_UNSAID = ("", "auto", "raw", "data", "identity", "unknown", Gf.ColorSpaceNames.LinearRec709, "lin_rec709", "none")
+
+
+@dataclass(frozen=True)
+class Place:
+    """How an image lies on a surface."""
+
+    uv: str = "st"
+    transform: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """What comes out of a network."""
+
+    pixels: Floats
+    """float [h, w, c], [1, 1, c] for a constant; row 0 at the top."""
+    outside: Floats
+    """float [c], the value beyond the image's edges."""
+    place: Place | None
+    """None: it is a constant."""
+    key: Hashable
+    """Equal where the content is."""
+    name: str = ""
+    """Of the image."""
+    primvar: str = ""
+    """Read from the surface's primvar of this name; `pixels` is the value where it has none."""
+
+    @property
+    def mean(self) -> Floats:
+        """Over the pixels, float64 [c]."""
+        return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
+
+
+def constant(*channels: float) -> Signal:
+    """The same everywhere."""
+    at = np.array(channels, np.float64)
+    return Signal(at.reshape(1, 1, -1), at, None, tuple(channels))
+
+
+def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> Signal:
+    """A function of signals, pixel by pixel; it takes and gives arrays [..., c].
+
+    Args:
+        label: Tells functions apart.
+        function: Of as many arrays.
+        signals: Their arguments.
+    """
+    images = [s for s in signals if s.place is not None]
+    key = (label, *(s.key for s in signals))
+    if not images:
+        made = _finite(function(*(s.pixels for s in signals)))
+        return Signal(made, made[0, 0], None, key)
+    first = images[0]
+    together = [s for s in images if s.place == first.place]
+    height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
+    pixels, outside = [], []
+    for s in signals:
+        if s.place is not None and s.place != first.place:
+            pixels.append(s.mean.reshape(1, 1, -1))
+            outside.append(s.mean)
+        else:
+            fits = s.place is None or s.pixels.shape[:2] == (height, width)
+            pixels.append(s.pixels if fits else resized(s.pixels, height, width))
+            outside.append(s.outside)
+    made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
+    made = np.broadcast_to(made, (height, width, made.shape[-1]))
+    return Signal(_compact(made), _finite(function(*outside)), first.place, key, first.name)
+
+
+def _finite(values: Floats) -> Floats:
+    """Arithmetic in a file may overflow."""
+    return np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
+
+
+def select(signal: Signal, channels: list[int]) -> Signal:
+    """Some channels, in any order."""
+    pixels, outside = signal.pixels[..., channels], np.asarray(signal.outside)[channels]
+    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key))
+
+
+def as_color(signal: Signal) -> Signal:
+    """Three channels: the first three, or one thrice."""
+    count = signal.pixels.shape[2]
+    if count == 3:
+        return signal
+    return select(signal, [0, 1, 2] if count > 3 else [0, 0, 0])
+
+
+class Images:
+    """The images of a scene and the textures made of them, each once.
+
+    Args:
+        report: Where troubles and counts go.
+        default_wrap: The wrap mode where neither the network nor the file gives one.
+    """
+
+    def __init__(self, report: Report, default_wrap: str = "black") -> None:
+        self.report = report
+        self.default_wrap = default_wrap
+        self._images: dict[tuple[str, str], Image | str] = {}
+        self._textures: dict[Hashable, Texture] = {}
+        self._left = MAX_TEXTURE_PIXELS
+
+    def read(self, asset: Sdf.AssetPath, space: str, resolved: str = "") -> Image:
+        """An image, from the file the first time.
+
+        Raises:
+            Unreadable: There is none.
+        """
+        key = (resolved or asset.resolvedPath or asset.path, space)
+        if key not in self._images:
+            limit = max(min(MAX_PIXELS, self._left // 2), 1)
+            try:
+                image = read_texture(resolved or asset, space, limit)
+            except Unreadable as trouble:
+                self._images[key] = str(trouble)
+            else:
+                self._left -= image.pixels.shape[0] * image.pixels.shape[1]
+                self._images[key] = replace(image, pixels=_compact(image.pixels))
+                self.report.stats["images"] += 1
+                if image.pixels.shape[:2] != (image.height, image.width):
+                    self.report.warn(asset.path, "image averaged down to fit the memory for textures ({n} in all)")
+        found = self._images[key]
+        if isinstance(found, str):
+            raise Unreadable(found)
+        return found
+
+    def texture(self, signal: Signal) -> Texture:
+        """A signal as a texture; equal ones are the same."""
+        assert signal.place is not None
+        key = (signal.key, signal.place)
+        if key not in self._textures:
+            red, green, blue = np.broadcast_to(signal.outside, 3).tolist()
+            self._textures[key] = Texture(
+                signal.name,
+                signal.pixels,
+                signal.place.wrap,
+                (red, green, blue),
+                signal.place.uv,
+                np.array(signal.place.transform, np.float64),
+            )
+        return self._textures[key]
+
+
+def _compact(pixels: Floats) -> Floats:
+    """In halves where they are enough: 11 bits from 6e-5 to 65504."""
+    if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
+        return pixels
+    return pixels.astype(np.float16)
+
+
+class Network:
+    """Evaluates the inputs of shading nodes.
+
+    Args:
+        images: Of the scene.
+        material: Named in warnings.
+        time: Of the values.
+    """
+
+    def __init__(self, images: Images, material: object, time: Usd.TimeCode) -> None:
+        self._images, self._time = images, time
+        self.material = material
+        self._nodes = 0
+
+    def warn(self, what: str) -> None:
+        """Say something about the material."""
+        self._images.report.warn(self.material, what)
+
+    def texture(self, signal: Signal) -> Texture:
+        """A signal that has a place, as a texture."""
+        return self._images.texture(signal)
+
+    def evaluate(self, shader_input: UsdShade.Input, default: Signal) -> Signal:
+        """What a shader's input gets; the default where nothing is authored, or where it cannot be read."""
+        self._nodes = 0
+        try:
+            return self._input(shader_input, default, _DEPTH)
+        except Unreadable as trouble:
+            self.warn(f"{shader_input.GetBaseName()}: {trouble}; the default is used")
+            return default
+
+    def _input(self, shader_input: UsdShade.Input, default: Signal, depth: int) -> Signal:
+        attribute = value.producer(shader_input)
+        if attribute is None:
+            return default
+        if not UsdShade.Output.IsOutput(attribute):
+            channels = value.raw(attribute, self._time)
+            if channels is None:
+                return default
+            array = np.asarray(channels)
+            if array.ndim > 1 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+                what = "a finite colour" if array.shape == (3,) else "a finite number"
+                raise Unreadable(f"{attribute.GetName()} is {_short(channels)}, not {what}")
+            array = np.atleast_1d(array).astype(np.float64)
+            if len(array) == 3:
+                array = value.to_linear_rec709(attribute, array.reshape(1, 3))[0]
+            return constant(*array.tolist())
+        self._nodes += 1
+        if depth == 0 or self._nodes > _NODE_BUDGET:
+            raise Unreadable("the network of nodes is too deep")
+        node, output = UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName()
+        identifier = str(node.GetShaderId() or "an unnamed node")
+        name = identifier.removeprefix("ND_")
+        if name in ("UsdUVTexture", "UsdUVTexture_23"):
+            return self._uv_texture(node, output, default)
+        if name.startswith("UsdPrimvarReader_"):
+            fallback = self._input(node.GetInput("fallback"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
+            return replace(fallback, primvar=self._text(node.GetInput("varname")))
+        if name.startswith("geompropvalue_"):
+            fallback = self._input(node.GetInput("default"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
+            return replace(fallback, primvar=self._text(node.GetInput("geomprop")))
+        if identifier.startswith("ND_"):
+            if name.startswith(("image_", "tiledimage_")):
+                return self._image(node, name)
+            made = self._operation(node, name, output, depth - 1)
+            if made is not None:
+                return made
+        raise Unreadable(f"the node {identifier} is not understood")
+
+    def _operation(self, node: UsdShade.Shader, name: str, output: str, depth: int) -> Signal | None:
+        """MaterialX's arithmetic; None if the node is none."""
+
+        def get(key: str, *default: float) -> Signal:
+            found = self._input(node.GetInput(key), constant(*default), depth)
+            if found.primvar:
+                self.warn(f"arithmetic on the primvar '{found.primvar}' is not read: it counts as its fallback")
+            return replace(found, primvar="")
+
+        kind = name.split("_")[0]
+        if kind == "constant":
+            return get("value", 0.0)
+        if kind in ("convert", "dot"):
+            found, wanted = get("in", 0.0), name.rsplit("_", 1)[-1]
+            return as_color(found) if wanted in ("color3", "vector3") else found
+        if kind == "extract":
+            found = get("in", 0.0)
+            index = int(get("index", 0.0).mean[0])
+            return select(found, [min(max(index, 0), found.pixels.shape[2] - 1)])
+        if kind.startswith("separate"):
+            found = get("in", 0.0)
+            index = {"r": 0, "x": 0, "g": 1, "y": 1, "b": 2, "z": 2}.get(output.removeprefix("out")[-1:], 3)
+            return select(found, [min(index, found.pixels.shape[2] - 1)])
+        if kind in ("combine2", "combine3", "combine4"):
+            parts = [get(f"in{k + 1}", 0.0) for k in range(int(kind[-1]))]
+            return combine(kind, lambda *a: np.concatenate(np.broadcast_arrays(*(x[..., :1] for x in a)), -1), *parts)
+        if kind in ("multiply", "divide"):
+            call = np.multiply if kind == "multiply" else lambda a, b: a / np.where(b == 0.0, np.inf, b)
+            return combine(kind, call, get("in1", 0.0), get("in2", 1.0))
+        if kind in ("add", "subtract", "min", "max", "minimum", "maximum", "power", "difference"):
+            functions: dict[str, Callable[..., Any]] = {
+                "add": np.add,
+                "subtract": np.subtract,
+                "difference": lambda a, b: np.abs(a - b),
+                "power": lambda a, b: np.maximum(a, 0.0) ** b,
+            }
+            call = functions.get(kind, np.minimum if kind.startswith("min") else np.maximum)
+            return combine(kind, call, get("in1", 0.0), get("in2", 1.0 if kind == "power" else 0.0))
+        if kind == "mix":
+            inputs = get("bg", 0.0), get("fg", 0.0), get("mix", 0.0)
+            return combine(kind, lambda bg, fg, mix: bg * (1.0 - mix) + fg * mix, *inputs)
+        if kind == "invert":
+            return combine(kind, np.subtract, get("amount", 1.0), get("in", 0.0))
+        if kind == "clamp":
+            return combine(kind, np.clip, get("in", 0.0), get("low", 0.0), get("high", 1.0))
+        if kind == "luminance":
+            weights = np.array([0.2126729, 0.7151522, 0.0721750])
+            return combine(
+                kind, lambda a: np.repeat((a[..., :3] @ weights)[..., None], 3, -1), as_color(get("in", 0.0))
+            )
+        return None
+
+    def _uv_texture(self, node: UsdShade.Shader, output: str, default: Signal) -> Signal:
+        """UsdUVTexture: out = image * scale + bias."""
+        fallback = self._constant(node, "fallback", [0.0, 0.0, 0.0, 1.0])
+        scale, bias = self._constant(node, "scale", [1.0] * 4), self._constant(node, "bias", [0.0] * 4)
+        channels = {"r": [0], "g": [1], "b": [2], "a": [3], "rgb": [0, 1, 2]}.get(output, [0, 1, 2])
+        attribute = value.producer(node.GetInput("file"))
+        space = self._text(node.GetInput("sourceColorSpace"), "auto")
+        try:
+            image, pixels, key, atlas = self._pixels(attribute, space, fallback, channels)
+        except Unreadable as trouble:
+            self.warn(f"{trouble}; the texture's fallback is used")
+            return constant(*fallback[channels].tolist())
+        wraps = []
+        for axis, name in enumerate(("wrapS", "wrapT")):
+            mode = self._text(node.GetInput(name), "useMetadata")
+            if mode not in _WRAPS:
+                mode = image.wrap[axis] or self._images.default_wrap
+            wraps.append(_WRAPS[mode])
+        uv, transform = self._coordinates(node.GetInput("st"), _DEPTH, unconnected=_at(0.0, 0.0))
+        place = _placed(uv, transform, (wraps[0], wraps[1]), atlas)
+        outside = fallback if atlas != (1, 1) else np.zeros(4)  # black is transparent black
+        key = (key, tuple(channels))
+        signal = Signal(pixels, outside[channels], place, key, self._path(attribute))
+        if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
+            return signal
+        label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
+        return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), signal)
+
+    def _image(self, node: UsdShade.Shader, name: str) -> Signal:
+        """MaterialX's image and tiledimage."""
+        wanted = name.rsplit("_", 1)[-1]
+        count = {"float": 1, "vector2": 2, "color4": 4, "vector4": 4}.get(wanted, 3)
+        default = self._constant(node, "default", [0.0] * count)
+        attribute = value.producer(node.GetInput("file"))
+        try:
+            space = "auto" if wanted.startswith("color") else "raw"
+            channels = list(range(count))
+            _, pixels, key, atlas = self._pixels(attribute, space, np.resize(default, 4), channels)
+        except Unreadable as trouble:
+            self.warn(f"{trouble}; the image's default is used")
+            return constant(*default.tolist())
+        modes = [
+            _MATERIALX_WRAPS.get(self._text(node.GetInput(f"{axis}addressmode"), "periodic"), Wrap.REPEAT)
+            for axis in "uv"
+        ]
+        uv, transform = self._coordinates(node.GetInput("texcoord"), _DEPTH, unconnected=np.eye(3))
+        if name.startswith("tiledimage_"):
+            tiling = self._constant(node, "uvtiling", [1.0, 1.0])
+            offset = self._constant(node, "uvoffset", [0.0, 0.0])
+            modes = [Wrap.REPEAT, Wrap.REPEAT]
+            transform = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]]) @ transform
+        place = _placed(uv, transform, (modes[0], modes[1]), atlas)
+        return Signal(pixels, default, place, (key, count), self._path(attribute))
+
+    def _path(self, attribute: Usd.Attribute | None) -> str:
+        """The path that an asset attribute holds."""
+        asset = value.raw(attribute, self._time) if attribute is not None else None
+        return asset.path if isinstance(asset, Sdf.AssetPath) else str(asset or "")
+
+    def _pixels(
+        self, attribute: Usd.Attribute | None, space: str, fallback: Floats, channels: list[int]
+    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
+        """The image that an attribute names: itself, some of its channels rgba [h, w, c], a key, its UDIM tiles."""
+        asset = value.raw(attribute, self._time) if attribute is not None else None
+        if isinstance(asset, str):
+            asset = Sdf.AssetPath(asset)
+        if attribute is None or not isinstance(asset, Sdf.AssetPath) or not asset.path:
+            raise Unreadable("no image file is named")
+        authored = str(attribute.GetColorSpace() or "")
+        if space == "auto" and authored in _SRGB_NAMES:
+            space = "sRGB"
+        elif space == "auto" and authored and authored != "auto":
+            space = "raw"
+        if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
+            return self._udim(attribute, asset, space, fallback, channels)
+        image = self._images.read(asset, space)
+        pixels = _converted(_channels(image, channels), authored)
+        return image, pixels, (asset.resolvedPath or asset.path, space, authored), (1, 1)
+
+    def _udim(
+        self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats, channels: list[int]
+    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
+        """The tiles of a UDIM set side by side in one image; those that are missing show the fallback."""
+        stack = attribute.GetPropertyStack(self._time)
+        tiles = UsdShade.UdimUtils.ResolveUdimTilePaths(asset.path, stack[0].layer if stack else None)
+        places = {int(number) - 1001: str(path) for path, number in tiles if str(number).isdigit()}
+        places = {at: path for at, path in places.items() if 0 <= at < 100}
+        if not places:
+            raise Unreadable(f"image '{asset.path}': no tile of it exists")
+        images: dict[int, Image] = {}
+        for at, path in sorted(places.items()):
+            try:
+                images[at] = self._images.read(asset, space, path)
+            except Unreadable as trouble:
+                self.warn(f"{trouble}; the texture's fallback is used")
+        if not images:
+            raise Unreadable(f"image '{asset.path}': no tile of it can be read")
+        columns, rows = max(at % 10 for at in images) + 1, max(at // 10 for at in images) + 1
+        height = max(image.pixels.shape[0] for image in images.values())
+        width = max(image.pixels.shape[1] for image in images.values())
+        shrink = math.sqrt(min(MAX_PIXELS / (height * width * columns * rows), 1.0))
+        height, width = max(int(height * shrink), 1), max(int(width * shrink), 1)
+        atlas = np.empty((rows * height, columns * width, len(channels)), np.float16)
+        atlas[:] = fallback[channels]
+        for at, image in images.items():
+            tile = _channels(image, channels)
+            if tile.shape[:2] != (height, width):
+                tile = resized(tile, height, width)
+            top, left = (rows - 1 - at // 10) * height, at % 10 * width
+            atlas[top : top + height, left : left + width] = tile
+        first = next(iter(images.values()))
+        return first, atlas, (asset.path, tuple(sorted(places.items())), space), (columns, rows)
+
+    def _coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
+        """The uv set that an input reads, and what is done to it, [3, 3]."""
+        attribute = value.producer(shader_input)
+        if attribute is None or not UsdShade.Output.IsOutput(attribute):
+            authored = value.raw(attribute, self._time) if attribute is not None else None
+            if authored is None or np.shape(authored) != (2,) or not np.isfinite(authored).all():
+                return "st", unconnected
+            return "st", _at(float(authored[0]), float(authored[1]))
+        node = UsdShade.Shader(attribute.GetPrim())
+        name = str(node.GetShaderId() or "").removeprefix("ND_")
+        if depth == 0:
+            raise Unreadable("the network of texture coordinates is too deep")
+        if name in ("UsdPrimvarReader_float2", "UsdPrimvarReader_vector2"):
+            return self._text(node.GetInput("varname"), "st"), np.eye(3)
+        if name == "texcoord_vector2":
+            return "st", np.eye(3)
+        if name == "geompropvalue_vector2":
+            return self._text(node.GetInput("geomprop"), "st"), np.eye(3)
+        if name == "UsdTransform2d":
+            uv, before = self._coordinates(node.GetInput("in"), depth - 1, unconnected)
+            move, scale = self._constant(node, "translation", [0.0, 0.0]), self._constant(node, "scale", [1.0, 1.0])
+            turn = _rotation(self._constant(node, "rotation", [0.0])[0])
+            turn[:2, 2] = move
+            return uv, turn @ np.diag([scale[0], scale[1], 1.0]) @ before
+        if name.startswith("place2d_vector2"):
+            uv, before = self._coordinates(node.GetInput("texcoord"), depth - 1, np.eye(3))
+            pivot, offset = self._constant(node, "pivot", [0.0, 0.0]), self._constant(node, "offset", [0.0, 0.0])
+            scale = self._constant(node, "scale", [1.0, 1.0])
+            shrink = np.diag([1.0 / scale[0] if scale[0] else 0.0, 1.0 / scale[1] if scale[1] else 0.0, 1.0])
+            turn = _rotation(-self._constant(node, "rotate", [0.0])[0])
+            return uv, _moved(*pivot) @ _moved(*-offset) @ turn @ shrink @ _moved(*-pivot) @ before
+        if name.startswith(("multiply_vector2", "add_vector2")):
+            uv, before = self._coordinates(node.GetInput("in1"), depth - 1, np.eye(3))
+            amount = np.resize(self._constant(node, "in2", [float(name.startswith("multiply"))]), 2)
+            return uv, (np.diag([*amount, 1.0]) if name.startswith("multiply") else _moved(*amount)) @ before
+        raise Unreadable(f"texture coordinates from the node {name} are not understood")
+
+    def _constant(self, node: UsdShade.Shader, name: str, default: list[float]) -> Floats:
+        """An input's numbers, float64 [c]; a network's are averaged."""
+        found = self._input(node.GetInput(name), constant(*default), 2).mean
+        return found if len(found) == len(default) else np.resize(found, len(default))
+
+    def _text(self, shader_input: UsdShade.Input, default: str = "") -> str:
+        attribute = value.producer(shader_input)
+        return value.text(attribute, self._time, default) or default if attribute is not None else default
+
+
+def _channels(image: Image, channels: list[int]) -> Floats:
+    """Channels of an image as if it had r, g, b and a, [h, w, c]; without a copy where possible."""
+    pixels, count = image.pixels, image.pixels.shape[2]
+    if channels == [0, 1, 2] and count >= 3:
+        return pixels[..., :3]
+    if channels == [3]:
+        return image.alpha[..., None]
+    planes = [image.rgb[..., c] if c < 3 else image.alpha for c in channels]
+    return planes[0][..., None] if len(planes) == 1 else np.stack(planes, axis=-1)
+
+
+def _converted(pixels: Floats, space: str) -> Floats:
+    """Linear pixels [h, w, 3 or 4] of a colour space as Rec.709; fewer channels are no colour."""
+    if pixels.shape[2] < 3:
+        return pixels
+    name = _LINEAR_NAMES.get(space.lower(), space)
+    if name.lower() in _UNSAID or space in _SRGB_NAMES or not Gf.ColorSpace.IsValid(name):
+        return pixels
+    target, source = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709), Gf.ColorSpace(name)
+    if source.GetGamma() != 1.0:
+        return pixels
+    matrix = np.array([target.Convert(source, Gf.Vec3f(*axis)).GetRGB() for axis in np.eye(3).tolist()])
+    rgb = np.maximum(np.asarray(pixels[..., :3], np.float32) @ matrix.astype(np.float32), 0.0)
+    return np.concatenate([rgb, pixels[..., 3:]], axis=-1)
+
+
+def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> Place:
+    if tiles != (1, 1):
+        transform = np.diag([1.0 / tiles[0], 1.0 / tiles[1], 1.0]) @ transform
+        wrap = (Wrap.BLACK, Wrap.BLACK)
+    if not (np.abs(transform) < 1e30).all():
+        raise Unreadable("the transform of the texture coordinates is not finite")
+    s, t = transform[0].tolist(), transform[1].tolist()
+    return Place(uv, ((s[0], s[1], s[2]), (t[0], t[1], t[2])), wrap)
+
+
+def _at(s: float, t: float) -> Floats:
+    """Everything to one point."""
+    return np.array([[0.0, 0.0, s], [0.0, 0.0, t], [0.0, 0.0, 1.0]])
+
+
+def _moved(x: float, y: float) -> Floats:
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def _rotation(degrees: float) -> Floats:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _short(found: object) -> str:
+    words = " ".join(str(found).split())
+    return words if len(words) <= 40 else words[:37] + "…"
