@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from warp_ir.scene import Mesh as Mesh
     from warp_ir.scene import Projection as Projection
     from warp_ir.scene import Scene as Scene
+    from warp_ir.scene import Shaping as Shaping
     from warp_ir.settings import RenderSettings as RenderSettings
     from warp_ir.usd import load_usd as load_usd
 
@@ -33,6 +34,7 @@ _HOME = {
     "Mesh": "scene",
     "Projection": "scene",
     "Scene": "scene",
+    "Shaping": "scene",
     "RenderSettings": "settings",
     "load_usd": "usd",
     "Film": "film",

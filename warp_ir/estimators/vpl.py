@@ -82,6 +82,8 @@ def _gather_pixels(
         x.position = gbuffer.position[pixel]
         x.normal = gbuffer.normal[pixel]
         x.shading_normal = gbuffer.shading_normal[pixel]
+        x.mesh = gbuffer.mesh[pixel]
+        x.seen = True
         throughput = wp.vec3(1.0)
         reach = 1.0 / wp.sqrt(lights.bound)
         depth = int(0)
@@ -104,7 +106,7 @@ def _gather_pixels(
             cosine = wp.dot(direction, x.shading_normal)
             hit = closest(scene, x.position, direction, reach)
             near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound)
+            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound, reach, x.mesh, x.seen)
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
@@ -126,6 +128,8 @@ def _gather_pixels(
             x.position = hit.position
             x.normal = hit.normal
             x.shading_normal = hit.normal
+            x.mesh = scene.triangle_mesh[hit.triangle]
+            x.seen = False
             rays = settings.rays_after
             depth += 1
     direct[pixel] = once / wp.pi
