@@ -12,6 +12,7 @@ from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
+from warp_ir.usd.linking import link
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
 from warp_ir.usd.walk import Site, walk
@@ -111,7 +112,7 @@ def _load(
     stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
     stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
     stats["instances"] = stats["native_instances"] + stats["point_instances"]
-    scene = Scene(meshes, materials, lights, name=report.source)
+    scene = Scene(meshes, materials, link(stage, lights, meshes), name=report.source)
     if view is None:
         along = "-Z" if axis == "Y" else "+Y"
         report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
@@ -120,16 +121,14 @@ def _load(
 
 
 def _lights(sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> tuple[Light, ...]:
-    lights = []
+    lights: list[Light] = []
     for site in sites:
         kind = LIGHTS[site.prim.GetPrimTypeInfo().GetSchemaTypeName()]
         try:
-            light = read_light(site.prim, kind, site.matrices[0], time, report)
+            found = read_light(site.prim, kind, site.matrices, time, report)
         except Unreadable as trouble:
             report.warn(site.prim.GetPath(), f"{trouble}; the light is skipped")
             continue
-        if light is None:
-            report.stats["lights_without_emission"] += 1
-        else:
-            lights.append(light)
+        report.stats["lights_without_emission"] += len(site.matrices) - len(found)
+        lights += found
     return tuple(lights)
