@@ -364,3 +364,17 @@ def test_spots_leave_the_rest_of_the_room_alone(shaping):
         picture = film.radiance()
         variances.append((film.standard_error() ** 2 / (picture**2 + 0.01 * picture.mean() ** 2)).mean())
     assert variances[0] < 4.0 * variances[1]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_lines_are_thin_cylinders(estimator, device):
+    """E = 2 r L (a/(h² + a²) + atan(a/h)/h) at the height h below the middle of a line of half length a.
+
+    That is what the loader makes of treatAsLine: a cylinder whose radius is 1e-4 of its length.
+    """
+    a, h, radius = 0.75, 2.0, 1.5e-4
+    line = ir.Light(
+        "line", LightKind.CYLINDER, (4000.0,) * 3, placed(np.eye(3), (0, h, 0)), length=2 * a, radius=radius
+    )
+    expected = 2.0 * radius * 4000.0 * (a / (h * h + a * a) + math.atan(a / h) / h) / math.pi
+    assert_mean(over_floor(line, estimator, device), expected, bias=3.0e-4)

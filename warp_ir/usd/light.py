@@ -224,7 +224,7 @@ def warn_of_unread(inputs: Inputs) -> None:
         color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
         if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
             inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
-    if UsdLux.LightAPI(prim).GetFiltersRel().GetTargets():
+    if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()):
         inputs.warn("light filters are not read")
 
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdShade
+from pxr import Gf, Sdf, Tf, Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Ints
 from warp_ir.usd.report import Unreadable
@@ -133,6 +133,14 @@ def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
     unique, where = np.unique(colors, axis=0, return_inverse=True)
     converted = [target.Convert(source, Gf.Vec3f(*c)).GetRGB() for c in unique.tolist()]
     return np.array(converted, dtype=np.float64).reshape(-1, 3)[where.reshape(-1)]
+
+
+def targets(relationship: Usd.Relationship) -> list[Sdf.Path]:
+    """What a relationship points to; nothing where it is absent, or is no relationship in the file."""
+    try:
+        return list(relationship.GetForwardedTargets()) if relationship else []
+    except Tf.ErrorException:
+        return []
 
 
 def producer(shader_input: UsdShade.Input) -> Usd.Attribute | None:

@@ -171,7 +171,7 @@ class _Walk:
         """Gives gprims to the deprecated GeometryLights that refer to them."""
         lamps: dict[Sdf.Path, Usd.Prim] = {}
         for lamp in self._lamps:
-            targets = lamp.GetRelationship("geometry").GetForwardedTargets()
+            targets = value.targets(lamp.GetRelationship("geometry"))
             lamps.update(dict.fromkeys(targets, lamp))
             if not any(site.prim.GetPath() in targets for site in self._found.shapes):
                 self._report.warn(lamp.GetPath(), "its geometry is nothing that is drawn: it emits nothing")
