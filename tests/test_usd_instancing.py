@@ -228,15 +228,6 @@ def test_colors_per_instance(tmp_path):
     assert scene.meshes[0].colors is None and scene.materials[0].albedo == (0, 0, 1)
 
 
-def test_lights_in_prototypes_are_named(tmp_path):
-    """A light below a point instancer is not replicated yet, and that is said."""
-    scene = load(
-        tmp_path,
-        instancer("int[] protoIndices = [0]\n point3f[] positions = [(0, 0, 0)]", 'def SphereLight "Proto" {\n}'),
-    )
-    assert warned(scene, "/P/Proto", "lights in the prototypes")
-
-
 def test_a_scene_that_cannot_fit_is_refused_before_it_is_allocated(tmp_path):
     """Nested instancers that multiply to hundreds of millions are an input error."""
     many = f"int[] protoIndices = {[0] * 3000}\n point3f[] positions = {[(0, 0, 0)] * 3000}"

@@ -150,12 +150,15 @@ def test_a_sphere_of_radius_zero_still_shines(tmp_path):
 
 
 def test_a_line_light_keeps_its_power(tmp_path):
-    """A light with treatAsLine becomes a thin cylinder with the same radiance times area."""
+    """With treatAsLine a light is so thin a cylinder that nobody can tell, with the same radiance times area."""
     text = "bool treatAsLine = true\n    float inputs:length = 3\n    float inputs:radius = 0.5\n"
     scene = load(tmp_path, light_text("CylinderLight", text))
     light = scene.lights[0]
-    assert warned(scene, "/L", "line") and light.radius < 0.01
+    assert scene.warnings == ("/: the stage draws no geometry", scene.warnings[-1]) and light.radius < 0.001
     assert light.radiance[0] * 2 * math.pi * light.radius * 3 == pytest.approx(2 * math.pi * 0.5 * 3)
+    text += "bool inputs:normalize = true"
+    light = load(tmp_path, light_text("CylinderLight", text)).lights[0]
+    assert light.radiance[0] * 2 * math.pi * light.radius * 3 == pytest.approx(1.0)
 
 
 def test_a_light_without_area_is_dropped(tmp_path):
@@ -193,37 +196,278 @@ def test_inputs_without_prefix_are_read(tmp_path):
 
 
 SHAPED = '(prepend apiSchemas = ["ShapingAPI"])'
+SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
 
 
 @pytest.mark.parametrize(
     ("kind", "head", "more", "word"),
     [
-        ("SphereLight", SHAPED, "", "shaping"),
-        ("RectLight", SHAPED, "float inputs:shaping:focus = 2", "shaping"),
-        ("RectLight", SHAPED, "float inputs:shaping:cone:angle = 30", "shaping"),
-        ("SphereLight", SHAPED, "asset inputs:shaping:ies:file = @a.ies@", "shaping"),
-        ("RectLight", "", "asset inputs:texture:file = @a.png@", "texture"),
-        ("RectLight", '(prepend apiSchemas = ["ShadowAPI"])', "bool inputs:shadow:enable = 0", "shadow"),
-        ("RectLight", "", "uniform bool collection:lightLink:includeRoot = 0", "lightLink"),
-        ("RectLight", "", "rel collection:shadowLink:excludes = </L>", "shadowLink"),
+        ("SphereLight", SHAPED, "asset inputs:shaping:ies:file = @nowhere.ies@", "not found"),
+        ("DomeLight", SHAPED, "float inputs:shaping:focus = 2", "shaping does not apply"),
+        ("RectLight", "", "asset inputs:texture:file = @nowhere.png@", "not found"),
+        ("DomeLight", "", "asset inputs:texture:file = @nowhere.exr@", "constant colour"),
+        ("DiskLight", "", "asset inputs:texture:file = @a.png@", "only rectangles and domes"),
+        ("RectLight", SHADOWS, "color3f inputs:shadow:color = (1, 0, 0)", "shadows are not read"),
         ("RectLight", "", "rel light:filters = </L>", "filters"),
-        ("DomeLight", "", "rel portals = </L>", "portals"),
-        ("PortalLight", "", "", "PortalLight"),
-        ("GeometryLight", "", "", "GeometryLight"),
+        ("PortalLight", "", "", "portals"),
+        ("GeometryLight", "", "", "geometry"),
         ("PluginLight", "", "", "PluginLight"),
     ],
 )
-def test_what_is_not_read_yet_is_named(tmp_path, kind, head, more, word):
+def test_what_is_not_honoured_is_named(tmp_path, kind, head, more, word):
     """Each feature that the picture will lack is a warning with the light's path."""
     assert warned(load(tmp_path, light_text(kind, more, head)), "/L", word)
 
 
+def test_portals_cost_no_word(tmp_path):
+    """The portals of a dome would guide its sampling, no more: its light is the same without."""
+    scene = load(tmp_path, light_text("DomeLight", "rel portals = </L>"))
+    assert len(scene.lights) == 1 and not warned(scene, "/L")
+
+
+def shaping(folder, kind, more):
+    return load(folder, light_text(kind, more, SHAPED)).lights[0].shaping
+
+
+def test_shaping_is_read(tmp_path):
+    """Cone, softness, focus and its tint, clamped to their ranges; applied alone, the schema is a cone of 90°."""
+    assert shaping(tmp_path, "SphereLight", "").cone_angle == 90.0
+    text = """float inputs:shaping:cone:angle = 30
+    float inputs:shaping:cone:softness = 1.5
+    float inputs:shaping:focus = 4
+    color3f inputs:shaping:focusTint = (0.5, 0, -1)"""
+    read = shaping(tmp_path, "RectLight", text)
+    assert (read.cone_angle, read.cone_softness, read.focus, read.focus_tint) == (30.0, 1.0, 4.0, (0.5, 0.0, 0.0))
+    assert load(tmp_path, light_text("SphereLight", text)).lights[0].shaping is None  # not applied
+
+
 @pytest.mark.parametrize(
-    ("kind", "more"), [("RectLight", ""), ("SphereLight", "float inputs:shaping:cone:angle = 180")]
+    ("kind", "more"),
+    [
+        ("RectLight", ""),
+        ("DistantLight", ""),
+        ("SphereLight", "float inputs:shaping:cone:angle = 180\n float inputs:shaping:focus = -2"),
+        ("DomeLight", ""),
+    ],
 )
-def test_shaping_without_effect_is_no_trouble(tmp_path, kind, more):
-    """A cone that covers all directions of emission changes nothing."""
-    assert not warned(load(tmp_path, light_text(kind, more, SHAPED)), "/L")
+def test_shaping_without_effect_is_none(tmp_path, kind, more):
+    """A cone that covers all directions of emission changes nothing and costs nothing."""
+    scene = load(tmp_path, light_text(kind, more, SHAPED))
+    assert scene.lights[0].shaping is None and not warned(scene, "/L")
+
+
+def photometry(vertical, horizontal, rows, *, head="TILT=NONE", kind=1, factor=1.0):
+    """An .ies file."""
+    numbers = "\n".join(" ".join(map(str, r)) for r in (vertical, horizontal, *rows))
+    counts = f"1 1000 {factor} {len(vertical)} {len(horizontal)} {kind} 2 0 0 0\n1.0 1.0 100"
+    return f"IESNA:LM-63-2002\n[TEST] x\n{head}\n{counts}\n{numbers}\n"
+
+
+IES = "asset inputs:shaping:ies:file = @./lamp.ies@\n    float inputs:shaping:cone:angle = 180\n    "
+
+
+def profile(folder, content, more=""):
+    (folder / "lamp.ies").write_text(content)
+    return shaping(folder, "SphereLight", IES + more).profile
+
+
+def test_photometry_is_read(tmp_path):
+    """Candela over polar angle, linear between the file's angles and nothing beyond them, times the multiplier."""
+    table = profile(tmp_path, photometry([0, 30, 90], [0], [[100, 40, 10]], factor=2.0))
+    assert table.shape[1] == 1
+    theta = (np.arange(len(table)) + 0.5) * 180.0 / len(table)
+    expected = np.where(theta < 90.0, 2.0 * np.interp(theta, [0, 30, 90], [100, 40, 10]), 0.0)
+    np.testing.assert_allclose(table[:, 0], expected)
+    tilted = photometry([0, 30, 90], [0], [[200, 80, 20]], head="TILT=INCLUDE\n1\n2\n0 90\n1 0.5")
+    np.testing.assert_allclose(profile(tmp_path, tilted), table)
+
+
+@pytest.mark.parametrize(
+    ("horizontal", "at", "same"),
+    [
+        ([0, 45, 90], 10.0, [170.0, 190.0, 350.0]),
+        ([0, 90, 180], 100.0, [260.0]),
+        ([90, 180, 270], 100.0, [80.0]),
+        ([0, 120, 240, 360], 10.0, []),
+    ],
+)
+def test_symmetric_photometry_goes_all_round(tmp_path, horizontal, at, same):
+    """A quadrant, half a turn and the half from 90° to 270° are mirrored; columns count from 0°."""
+    rows = [[10.0 * (k + 1), 1.0] for k in range(len(horizontal))]
+    if horizontal[-1] == 360:
+        rows[-1] = rows[0]
+    table = profile(tmp_path, photometry([0, 90], horizontal, rows))
+
+    def value(phi):
+        return table[0, int(phi / 360.0 * table.shape[1])]
+
+    folded = next((p for p in (at, *same) if horizontal[0] <= p <= horizontal[-1]), at)
+    middle = (int(folded / 360.0 * table.shape[1]) + 0.5) * 360.0 / table.shape[1]
+    expected = np.interp(middle, horizontal, [r[0] for r in rows])
+    assert value(folded) == pytest.approx(expected, rel=5e-3)
+    # The middle of a mirrored column is off by up to a column's width.
+    assert all(value(p) == pytest.approx(value(at), rel=0.05) for p in same)
+
+
+def test_photometry_scales_and_normalizes(tmp_path):
+    """An angleScale of 1/2 narrows the beam to half its angle; normalized, the mean over the (hemi)sphere is 1."""
+    file = photometry([0, 60, 60.001, 90], [0], [[100, 100, 0, 0]])
+    wide = profile(tmp_path, file)
+    narrow = profile(tmp_path, file, "float inputs:shaping:ies:angleScale = 0.5")
+    assert (wide > 50).sum() == pytest.approx(60 / 180 * len(wide), abs=1)
+    assert (narrow > 50).sum() == pytest.approx(30 / 180 * len(wide), abs=1)
+    up = photometry([90, 120, 120.001, 180], [0], [[0, 0, 100, 100]])
+    assert (profile(tmp_path, up) > 50).sum() == pytest.approx(60 / 180 * len(wide), abs=1)
+    narrow = profile(tmp_path, up, "float inputs:shaping:ies:angleScale = -0.5")
+    assert (narrow > 50).sum() == pytest.approx(30 / 180 * len(wide), abs=1) and narrow[-1, 0] == pytest.approx(100)
+    # 100 cd in a cone of 60°: 100 · 2π (1 - cos 60°) / 2π = 50 in the mean of the hemisphere.
+    assert profile(tmp_path, file, "bool inputs:shaping:ies:normalize = true").max() == pytest.approx(2.0, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "IESNA:LM-63-2002\nTILT=NONE\n1 2 3",
+        "TILT=NONE\n1 1000 1 99999999 99999999 1 2 0 0 0\n1 1 1\n0",
+        "TILT=NONE\n1 1000 1 -3 1 1 2 0 0 0\n1 1 1\n0",
+        photometry([0, 90], [0], [["nan", 1]]),
+        photometry([90, 0], [0], [[1, 1]]),
+        photometry([0, 90], [0], [["many", 1]]),
+        photometry([0, 90], [0], [[1, 1]], kind=2),
+        "\x00\xff" * 100,
+    ],
+)
+def test_bad_photometry_is_named(tmp_path, content):
+    """A file that is no photometry of type C leaves the light unshaped, and says so."""
+    (tmp_path / "lamp.ies").write_text(content)
+    scene = load(tmp_path, light_text("SphereLight", IES, SHAPED))
+    assert scene.lights[0].shaping is None and warned(scene, "/L", "lamp.ies")
+
+
+def write_png(path, pixels):
+    import OpenImageIO as oiio
+
+    out = oiio.ImageOutput.create(str(path))
+    out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8))
+    out.write_image(pixels)
+    out.close()
+
+
+def write_exr(path, pixels):
+    import OpenImageIO as oiio
+
+    out = oiio.ImageOutput.create(str(path))
+    out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT))
+    out.write_image(pixels)
+    out.close()
+
+
+def test_textures_are_read(tmp_path):
+    """The file's linear values multiply the radiance; row 0 is the top of the image; 8 bits are sRGB."""
+    pixels = np.arange(24, dtype=np.float32).reshape(2, 4, 3) - 3.0
+    write_exr(tmp_path / "t.exr", pixels)
+    write_png(tmp_path / "t.png", np.full((1, 1, 3), 188, np.uint8))
+    for kind in ("RectLight", "DomeLight", "DomeLight_1"):
+        light = load(tmp_path, light_text(kind, "asset inputs:texture:file = @./t.exr@")).lights[0]
+        np.testing.assert_array_equal(light.texture, np.maximum(pixels, 0.0))
+        light = load(tmp_path, light_text(kind, "asset inputs:texture:file = @./t.png@")).lights[0]
+        np.testing.assert_allclose(light.texture, 0.5029, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "pole", "up"),
+    [
+        ("DomeLight", "Z", "", (0, 1, 0)),
+        ("DomeLight_1", "Z", "", (0, 0, 1)),
+        ("DomeLight_1", "Y", "", (0, 1, 0)),
+        ("DomeLight_1", "Y", "Z", (0, 0, 1)),
+        ("DomeLight_1", "Z", "Y", (0, 1, 0)),
+    ],
+)
+def test_the_pole_of_a_dome(tmp_path, kind, axis, pole, up):
+    """A DomeLight's pole is +Y in any stage; a DomeLight_1's is the stage's up axis unless poleAxis says otherwise."""
+    write_exr(tmp_path / "t.exr", np.ones((2, 4, 3), np.float32))
+    more = "asset inputs:texture:file = @./t.exr@\n" + (f'uniform token poleAxis = "{pole}"' if pole else "")
+    scene = load(tmp_path, light_text(kind, more).join([f'(upAxis = "{axis}")\n', ""]))
+    matrix = scene.lights[0].world_from_light
+    np.testing.assert_allclose(matrix[:3, 1], up, atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
+    if up == (0, 0, 1):  # (x, y, z) → (x, z, -y): the middle of the texture, local +Z, lies along -Y
+        np.testing.assert_allclose(matrix[:3, 2], (0, -1, 0), atol=1e-12)
+
+
+def test_shadows_can_be_switched_off(tmp_path):
+    """ShadowAPI's enable, where the schema is applied."""
+    off = "bool inputs:shadow:enable = 0"
+    scene = load(tmp_path, light_text("RectLight", off, SHADOWS))
+    assert not scene.lights[0].shadows and not warned(scene, "/L")
+    assert load(tmp_path, light_text("RectLight", off)).lights[0].shadows
+
+
+LINKED = """
+def Xform "Geom" {
+    def Cube "a" {}
+    def Cube "b" {}
+    def Xform "c" {
+        def Cube "inner" {}
+    }
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "unlit", "shadowless"),
+    [
+        ("", set(), set()),
+        (
+            "uniform bool collection:lightLink:includeRoot = 0\n rel collection:lightLink:includes = </Geom/a>",
+            {1, 2},
+            (),
+        ),
+        ("rel collection:lightLink:excludes = </Geom/c>", {2}, set()),
+        ("rel collection:shadowLink:excludes = [</Geom/a>, </Geom/b>]", set(), {0, 1}),
+        ("uniform bool collection:lightLink:includeRoot = 0", {0, 1, 2}, set()),
+    ],
+)
+def test_links_are_read(tmp_path, more, unlit, shadowless):
+    """The meshes outside the lightLink collection are not lit, those outside shadowLink cast no shadow."""
+    scene = load(tmp_path, light_text("SphereLight", more) + LINKED)
+    assert [m.name for m in scene.meshes] == ["/Geom/a", "/Geom/b", "/Geom/c/inner"]
+    assert scene.lights[0].unlit == frozenset(unlit) and scene.lights[0].shadowless == frozenset(shadowless)
+    assert not warned(scene, "link")
+
+
+def test_lights_of_instanced_prototypes(tmp_path):
+    """Each instance of a point instancer has its light, and normalize sees each one's scale."""
+    text = """def PointInstancer "I" {
+    rel prototypes = </I/P>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = [(0, 0, 0), (5, 0, 0)]
+    float3[] scales = [(1, 1, 1), (2, 2, 2)]
+    def Xform "P" {
+        def RectLight "L" {
+            bool inputs:normalize = true
+        }
+    }
+}"""
+    scene = load(tmp_path, text)
+    assert [light.radiance[0] for light in scene.lights] == [1.0, 0.25] and not warned(scene, "/I")
+    assert [light.world_from_light[0, 3] for light in scene.lights] == [0.0, 5.0]
+
+
+def test_geometry_lights(tmp_path):
+    """The deprecated GeometryLight makes the gprim emit to which it refers."""
+    text = """def GeometryLight "L" {
+    rel geometry = </S>
+    float inputs:intensity = 3
+}
+def Sphere "S" {}
+def Sphere "T" {}
+"""
+    scene = load(tmp_path, text)
+    glow = {mesh.name: scene.materials[mesh.material[0]].emission for mesh in scene.meshes}
+    assert glow == {"/S": (3.0, 3.0, 3.0), "/T": (0.0, 0.0, 0.0)} and not warned(scene, "/L")
 
 
 MESH_LIGHT = """def Mesh "M" (prepend apiSchemas = ["%s"]) {

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from warp_ir.scene import Mesh as Mesh
     from warp_ir.scene import Projection as Projection
     from warp_ir.scene import Scene as Scene
+    from warp_ir.scene import Shaping as Shaping
     from warp_ir.scene import Texture as Texture
     from warp_ir.scene import Wrap as Wrap
     from warp_ir.settings import RenderSettings as RenderSettings
@@ -36,6 +37,7 @@ _HOME = {
     "Mesh": "scene",
     "Projection": "scene",
     "Scene": "scene",
+    "Shaping": "scene",
     "Texture": "scene",
     "Wrap": "scene",
     "RenderSettings": "settings",

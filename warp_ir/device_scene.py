@@ -16,7 +16,9 @@ import warp as wp
 
 from warp_ir import sampling
 from warp_ir.bvh import Bvh, build_bvh
+from warp_ir.grid import GridList, GridTables, cell_measure
 from warp_ir.launch import Launcher
+from warp_ir.light_control import ControlTables, upload_controls
 from warp_ir.scene import Camera, InputError, Light, LightKind, Material, Mesh, Projection, Scene, Texture
 from warp_ir.settings import RenderSettings
 from warp_ir.texture import TextureTable, mean_on_triangles, upload_textures
@@ -40,6 +42,15 @@ class Patterns:
     textures: TextureTable
     triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
     corner_uvs: wp.array[wp.vec2]
+
+
+@wp.struct
+class LightTables:
+    """Textures and controls of lights."""
+
+    texture: wp.array[wp.int32]  # [lights], the grid that multiplies the radiance, or -1
+    grids: GridTables
+    controls: ControlTables
 
 
 @wp.struct
@@ -84,6 +95,13 @@ class SceneData:
     light_radiance: wp.array[wp.vec3]
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
     light_emitter: wp.array[wp.int32]  # its row in the emitter tables, or -1
+    textured_count: int  # lights with a texture
+    control_count: int  # lights with a control
+    shaped_count: int  # of them with a shaping
+    only_sampled_count: int  # of them those with an area that rays are not to find
+    light_tables: wp.array[
+        LightTables
+    ]  # one row: what few scenes have must not be copied with the others' at every call
     shape_count: int  # lights with an area: RECT to CYLINDER
     shape_bvh: wp.uint64  # boxes around them
     shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
@@ -214,8 +232,8 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
     data.footprint = math.sqrt(area / _PATCHES)
     data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
     mesh = surfaces.keep[0] if surfaces is not None else _upload_surfaces(scene, frame, data, launcher)
-    shapes = _upload_lights(scene.lights, frame, data, launcher)
-    _upload_emitters(scene, frame, data, launcher)
+    shapes, gain = _upload_lights(scene, frame, data, launcher)
+    _upload_emitters(scene, gain, frame, data, launcher)
     data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
     itself = launcher.array([data], SceneData)
     data.address = wp.uint64(itself.ptr)
@@ -303,6 +321,14 @@ def _check(scene: Scene, checked: Collection[int]) -> None:
             raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
         if light.world_from_light.shape != (4, 4) or not np.isfinite(light.world_from_light).all():
             raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
+        texture = light.texture
+        if texture is not None:
+            if light.kind not in (LightKind.RECT, LightKind.DOME):
+                raise InputError(f"{light.name}: only RECT and DOME lights take a texture")
+            if texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
+                raise InputError(f"{light.name}: texture must have shape [h, w, 3]")
+            if not (np.isfinite(texture).all() and texture.min() >= 0.0):
+                raise InputError(f"{light.name}: texture must be finite and not negative")
 
 
 def _check_material(material: Material) -> None:
@@ -434,14 +460,26 @@ def _upload_corners(
     return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), dtype)
 
 
-def _upload_lights(lights: tuple[Light, ...], frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
-    """Fills the light tables; returns the owner of the BVH over the lights with an area."""
+def _upload_lights(
+    scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher
+) -> tuple[Any, npt.NDArray[np.float64]]:
+    """Fills the light tables.
+
+    Returns:
+        The owners of what is referred to by address, and what textures and shaping make of each light's power.
+    """
+    lights = scene.lights
     axes = np.array([_light_axes(light) * _unit(light, frame) for light in lights]).reshape(-1, 3, 3)
     origin = frame.to_device(np.array([light.world_from_light[:3, 3] for light in lights]).reshape(-1, 3))
     radiance = np.array([light.radiance for light in lights], np.float64).reshape(-1, 3)
     points = np.array([light.kind == LightKind.POINT for light in lights], bool)
     radiance[points] *= frame.scale**2  # intensity is radiance times area
     angle = [1.0 - math.cos(math.radians(0.5 * min(max(light.angle, 0.0), 360.0))) for light in lights]
+    grids = GridList()
+    texture, gain = _add_textures(lights, grids)
+    tables = LightTables()
+    tables.controls, peak, share = upload_controls(lights, axes, len(scene.meshes), grids, launcher)
+    radiance *= peak[:, None]
 
     data.light_count = len(lights)
     data.light_kind = launcher.array([int(light.kind) for light in lights] or [0], wp.int32)
@@ -450,6 +488,12 @@ def _upload_lights(lights: tuple[Light, ...], frame: DeviceFrame, data: Any, lau
     data.light_inverse = launcher.array(_rows(np.array([_inverse(a) for a in axes]), (3, 3)), wp.mat33)
     data.light_radiance = launcher.array(_rows(radiance), wp.vec3)
     data.light_angle = launcher.array(angle or [0.0], wp.float32)
+    tables.texture = launcher.array(texture or [-1], wp.int32)
+    tables.grids = grids.upload(launcher)
+    data.textured_count = sum(k >= 0 for k in texture)
+    data.control_count, data.shaped_count = tables.controls.count, tables.controls.shaped_count
+    data.only_sampled_count = tables.controls.sampled_count
+    data.light_tables = launcher.array([tables], LightTables)
 
     shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
     reach = np.abs(axes[shapes]).sum(axis=2) * 1.001 if shapes else np.zeros((1, 3))
@@ -458,7 +502,27 @@ def _upload_lights(lights: tuple[Light, ...], frame: DeviceFrame, data: Any, lau
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
     data.shape_bvh = bvh.id
-    return bvh
+    return (bvh, tables), gain * share
+
+
+def _add_textures(lights: tuple[Light, ...], grids: GridList) -> tuple[list[int], npt.NDArray[np.float64]]:
+    """Adds the lights' textures to the grids; returns each light's grid (-1: none) and what it makes of the power."""
+    index, means = [], np.ones(len(lights))
+    known: dict[tuple[int, bool], int] = {}  # lights may share an image
+    for k, light in enumerate(lights):
+        if light.texture is None:
+            index.append(-1)
+            continue
+        key = id(light.texture), light.kind == LightKind.DOME
+        theta = math.pi if light.kind == LightKind.DOME else 0.0
+        tint = np.array(light.radiance) / max(float(np.mean(light.radiance)), 1.0e-30)
+        measure = cell_measure(len(light.texture), theta)
+        rows = light.texture.mean(axis=1, dtype=np.float64) @ tint / 3.0
+        means[k] = float(rows @ measure / measure.sum())
+        if key not in known:
+            known[key] = grids.add(light.texture, theta=theta)
+        index.append(known[key])
+    return index, means
 
 
 def _rows(table: Any, shape: tuple[int, ...] = (3,)) -> Any:
@@ -496,10 +560,13 @@ def _inverse(axes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return np.zeros((3, 3))  # collapsed to a plane: it still emits, but no ray can find it
 
 
-def _upload_emitters(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> None:
+def _upload_emitters(
+    scene: Scene, gain: npt.NDArray[np.float64], frame: DeviceFrame, data: Any, launcher: Launcher
+) -> None:
     """One list of everything that emits, with the probabilities of choosing each: in proportion to its power.
 
-    Any positive probabilities are right; a power is estimated from mean radiance times area, no more.
+    Any positive probabilities are right; a power is estimated from mean radiance times area, no more. `gain` is what
+    textures and shaping make of each light's.
     """
     kinds: list[npt.NDArray[np.int32]] = []
     items: list[npt.NDArray[np.int32]] = []
@@ -508,6 +575,7 @@ def _upload_emitters(scene: Scene, frame: DeviceFrame, data: Any, launcher: Laun
     axes = data.light_axes.numpy()
     for k, light in enumerate(scene.lights):
         power = float(np.mean(radiance[k], dtype=np.float64)) * _power_per_radiance(light, axes[k], data.radius)
+        power *= gain[k]
         kinds.append(np.array([light.kind], np.int32))
         items.append(np.array([k], np.int32))
         powers.append(np.array([power]))

@@ -18,7 +18,8 @@ import warp as wp
 from warp_ir.bvh import _on_cuda
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
-from warp_ir.surface import visible
+from warp_ir.light_control import emphasis
+from warp_ir.lights import arriving
 from warp_ir.vpl import VplBuffer
 
 wp.set_module_options({"enable_backward": False})
@@ -26,6 +27,7 @@ wp.set_module_options({"enable_backward": False})
 LANES = 16
 _LANES = wp.constant(LANES)
 _ROWS = wp.constant(10)
+_SHAPE_ROWS = wp.constant(7)
 BLOCKS_PER_SET = 16
 """A pixel weighs about 16 x 16 VPLs: a fraction of the cost of the shadow rays that follow."""
 MAX_SETS = 64
@@ -43,7 +45,9 @@ vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
 class VplSets:
     """VPLs arranged for weighing: `sets` sets of `blocks` blocks of 16, the last padded with VPLs of no intensity.
 
-    Ten rows per block: x, y, z, w of the position, x, y, z, a of the normal, luminance, bound on G.
+    Ten rows per block: x, y, z, w of the position, x, y, z, a of the normal, luminance, bound on G. If the VPLs lie on
+    lights and any is shaped, seven more in a table of their own: x, y, z of its axis, and slope, offset, least value
+    and end of the ramp by which its VPLs are weighed (`light_control.emphasis`).
     """
 
     sets: int
@@ -51,6 +55,8 @@ class VplSets:
     count: int  # VPLs in all sets
     bound: float
     rows: wp.array[vec16]
+    shaped: int  # 1: there are rows of shaping
+    shapes: wp.array[vec16]
     order: wp.array[wp.int32]  # their rows in `vpls`, set by set and in each along a space-filling curve
     vpls: VplBuffer
 
@@ -62,6 +68,8 @@ class Receiver:
     position: wp.vec3
     normal: wp.vec3  # geometric
     shading_normal: wp.vec3
+    mesh: int
+    seen: bool  # by the camera
 
 
 @wp.func
@@ -109,6 +117,35 @@ def _weigh(rows: wp.array[vec16], first: int, x: Receiver) -> vec16:
 
 
 @wp.func_native("""
+    const wp::vec_t<16, float>* b = rows.data + first;
+    const wp::vec_t<16, float>* s = shapes.data + first_shape;
+    wp::vec_t<16, float> out;
+    for (int i = 0; i < 16; ++i) {
+        const float w = b[3][i];
+        const float dx = b[0][i] - x.position[0] * w, dy = b[1][i] - x.position[1] * w;
+        const float dz = b[2][i] - x.position[2] * w;
+        const float inverse = 1.0f / sqrtf(dx * dx + dy * dy + dz * dz + 1.0e-30f);
+        const float cosine = -(s[0][i] * dx + s[1][i] * dy + s[2][i] * dz) * inverse;
+        const float ramp = s[3][i] * cosine + s[4][i];
+        const float above = ramp > s[5][i] ? ramp : s[5][i];
+        out[i] = cosine < s[6][i] ? 0.0f : (above < 1.0f ? above : 1.0f);
+    }
+    return out;
+""")
+def _emphasize(rows: wp.array[vec16], first: int, shapes: wp.array[vec16], first_shape: int, x: Receiver) -> vec16:
+    """What shaping makes of the weights of a block."""
+    ...
+
+
+@wp.func
+def _weigh_block(lit: VplSets, block: int, x: Receiver) -> vec16:
+    f = _weigh(lit.rows, _ROWS * block, x)
+    if lit.shaped == 1:
+        f = wp.cw_mul(f, _emphasize(lit.rows, _ROWS * block, lit.shapes, _SHAPE_ROWS * block, x))
+    return f
+
+
+@wp.func_native("""
     wp::vec_t<16, int> out;
     for (int i = 0; i < 16; ++i) out[i] = count[i] + (sum[i] <= target[i] ? 1 : 0);
     return out;
@@ -131,9 +168,16 @@ def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, slot: int, share: flo
     """What the chosen VPL gives: `share` (= S/M) in the colour of its intensity, if it is visible."""
     if slot < lit.count:
         vpl = lit.order[slot]
-        if lit.vpls.bounce[vpl] <= max_bounce and visible(scene, x.position, lit.vpls.position[vpl]):
+        if lit.vpls.bounce[vpl] <= max_bounce:
+            control = int(-1)
+            if scene.control_count > 0 and vpl < lit.vpls.on_lights:
+                control = lit.vpls.control[vpl]
+            arrives = arriving(scene, control, x.position, x.mesh, x.seen, lit.vpls.position[vpl])
+            if control >= 0:  # it was weighed with this factor
+                shape = scene.light_tables[0].controls.rows[control]
+                arrives = arrives / emphasis(shape, x.position, lit.vpls.position[vpl])
             intensity = lit.vpls.intensity[vpl]
-            return intensity * (share / luminance(intensity))
+            return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
     return wp.vec3(0.0)
 
 
@@ -160,7 +204,7 @@ def _gather_in_blocks(
     begin = chosen_set * lit.blocks
     sums = vec16()
     for block in range(begin, begin + lit.blocks):
-        sums += _weigh(lit.rows, _ROWS * block, x)
+        sums += _weigh_block(lit, block, x)
     total = _sum(sums)
     if total <= 0.0:
         return out
@@ -169,7 +213,7 @@ def _gather_in_blocks(
     running = vec16()
     candidate = vec16i()
     for block in range(begin, begin + lit.blocks):
-        running += _weigh(lit.rows, _ROWS * block, x)
+        running += _weigh_block(lit, block, x)
         candidate = _count_below(running, target, candidate)
     # ... and of the sixteen candidates M, in proportion to the sums of their lanes.
     share = total / float(rays)
@@ -194,14 +238,14 @@ def _gather_one_by_one(
     end = wp.min(begin + lit.blocks * _LANES, lit.count)
     total = float(0.0)
     for slot in range(begin, end):
-        total += _weigh_one(lit, x, slot)
+        total += _weigh_one(scene, lit, x, slot)
     if total <= 0.0:
         return out
     share = total / float(rays)
     running = float(0.0)
     drawn = int(0)
     for slot in range(begin, end):
-        running += _weigh_one(lit, x, slot)
+        running += _weigh_one(scene, lit, x, slot)
         while drawn < rays and (float(drawn) + u[1]) * share < running:
             out += _shadowed(scene, lit, x, slot, share, max_bounce)
             drawn += 1
@@ -209,11 +253,29 @@ def _gather_one_by_one(
 
 
 @wp.func
-def _weigh_one(lit: VplSets, x: Receiver, slot: int) -> float:
+def _weigh_one(scene: SceneData, lit: VplSets, x: Receiver, slot: int) -> float:
     vpl = lit.order[slot]
     normal = lit.vpls.normal[vpl]
     bound = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
-    return luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
+    weight = luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
+    if lit.shaped == 1 and weight > 0.0:
+        weight *= _emphasis_of(scene, lit, vpl, x.position)
+    return weight
+
+
+@wp.func
+def _emphasis_of(scene: SceneData, lit: VplSets, vpl: int, position: wp.vec3) -> float:
+    """The same for one VPL on a light."""
+    row = lit.vpls.control[vpl]
+    if row < 0:
+        return 1.0
+    control = scene.light_tables[0].controls.rows[row]
+    target = lit.vpls.position[vpl]
+    to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
+    cosine = -wp.dot(wp.vec3(control.frame[2, 0], control.frame[2, 1], control.frame[2, 2]), wp.normalize(to_light))
+    if cosine < control.cutoff:
+        return 0.0
+    return emphasis(control, position, target)
 
 
 @wp.func
@@ -259,6 +321,27 @@ def _pack(first: int, lit: VplSets) -> None:
         lit.rows[_ROWS * i + 9][lane] = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
 
 
+@wp.kernel
+def _pack_shaping(first: int, scene: SceneData, lit: VplSets) -> None:
+    """Writes the rows of shaping of block `i`."""
+    i = first + wp.tid()
+    begin = (i // lit.blocks) * lit.blocks * _LANES
+    for lane in range(_LANES):
+        slot = begin + lit.blocks * lane + i % lit.blocks
+        axis = wp.vec3(0.0)
+        ramp = wp.vec4(0.0, 1.0, 1.0, -2.0)  # level: not shaped
+        if slot < lit.count:
+            row = lit.vpls.control[lit.order[slot]]
+            if row >= 0:
+                control = scene.light_tables[0].controls.rows[row]
+                axis = wp.vec3(control.frame[2, 0], control.frame[2, 1], control.frame[2, 2])
+                ramp = wp.vec4(control.slope, control.offset, control.least, control.cutoff)
+        for k in range(3):
+            lit.shapes[_SHAPE_ROWS * i + k][lane] = axis[k]
+        for k in range(4):
+            lit.shapes[_SHAPE_ROWS * i + 3 + k][lane] = ramp[k]
+
+
 def _divide(vpls: Any, count: int) -> Any:
     """`VplSets` for some of the VPLs, still empty: as many sets as a pixel is spared."""
     lit = VplSets()
@@ -287,6 +370,11 @@ def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any
             wp.utils.radix_sort_pairs(keys, lit.order, lit.count)
         rows = 1 if launcher.device.is_cuda else max(_ROWS * lit.sets * lit.blocks, 1)
         lit.rows = launcher.empty(rows, vec16)
+        lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
+        packed = lit.shaped == 1 and not launcher.device.is_cuda
+        lit.shapes = launcher.empty(max(_SHAPE_ROWS * lit.sets * lit.blocks, 1) if packed else 1, vec16)
         if not launcher.device.is_cuda:
             launcher.launch(_pack, lit.sets * lit.blocks, [lit])
+        if packed:
+            launcher.launch(_pack_shaping, lit.sets * lit.blocks, [scene.data, lit])
     return lights, surfaces

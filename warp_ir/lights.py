@@ -2,15 +2,26 @@
 
 A point on an emitter is homogeneous, position (x, y, z, w): w = 1 for a place, w = 0 for the direction
 towards a distant light. Its normal (x, y, z, a) gives the emitter's cosine as max(0, a + n·ω): a = 0 for a
-surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gathers light needs a second case.
+surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gathers light needs a second case; but
+where a light has a `LightControl`, `arriving` tells how much of it gets to a point, and takes the place of `visible`.
 """
 
 import warp as wp
 
 from warp_ir import sampling
 from warp_ir.device_scene import _TRIANGLE_EMITTER, SceneData
+from warp_ir.grid import (
+    cell_direction,
+    cell_place,
+    direction_density,
+    place_density,
+    sample_cell,
+    value_along,
+    value_at_place,
+)
+from warp_ir.light_control import linked, shaping_factor
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, emitted, offset, presence
+from warp_ir.surface import Hit, closest, emitted, offset, presence, visible
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,6 +33,8 @@ _POINT = wp.constant(int(LightKind.POINT))
 _DISTANT = wp.constant(int(LightKind.DISTANT))
 _DOME = wp.constant(int(LightKind.DOME))
 _TRIANGLE = wp.constant(_TRIANGLE_EMITTER)
+_CROSSINGS = wp.constant(64)
+"""Most surfaces without a shadow that light is followed through."""
 
 
 @wp.struct
@@ -31,7 +44,8 @@ class LightPoint:
     position: wp.vec4
     normal: wp.vec4
     intensity: wp.vec3  # radiance / density: W/sr for a place, W/m² for a direction
-    density: float  # per area for a place, per solid angle for a direction; 0: cannot be hit by a ray
+    density: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
+    control: int  # row of its `LightControl`; -1: it has none
 
 
 @wp.struct
@@ -88,7 +102,24 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
     if scene.open_count > 0:
         radiance = radiance * presence(scene, triangle, at_a, at_b)
     out.intensity = radiance / out.density
+    out.control = -1
     return out
+
+
+@wp.func
+def _texture_of(scene: SceneData, light: int) -> int:
+    """The grid that multiplies a light's radiance, or -1."""
+    if scene.textured_count == 0:
+        return -1
+    return scene.light_tables[0].texture[light]
+
+
+@wp.func
+def control_of(scene: SceneData, light: int) -> int:
+    """The row of a light's control, or -1; light -1 is a surface."""
+    if scene.control_count == 0 or light < 0:
+        return -1
+    return scene.light_tables[0].controls.of_light[light]
 
 
 @wp.func
@@ -113,6 +144,16 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     kind = scene.light_kind[light]
     n = wp.vec3(0.0, 0.0, 1.0)
     q = wp.vec3(u[0] - 0.5, u[1] - 0.5, 0.0)
+    radiance = scene.light_radiance[light]
+    relative = float(1.0)
+    texture = _texture_of(scene, light)
+    if texture >= 0:
+        cell = sample_cell(scene.light_tables[0].grids, texture, u)
+        place = cell_place(scene.light_tables[0].grids, texture, cell)
+        grid = scene.light_tables[0].grids.grids[texture]
+        relative = cell.probability * float(grid.rows) * float(grid.columns)
+        radiance = wp.cw_mul(radiance, value_at_place(scene.light_tables[0].grids, texture, place))
+        q = wp.vec3(0.5 - place[0], 0.5 - place[1], 0.0)
     if kind == _DISK:
         d = sampling.to_disk(u)
         q = wp.vec3(d[0], d[1], 0.0)
@@ -126,11 +167,14 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     p = scene.light_origin[light] + scene.light_axes[light] * q
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
     out = LightPoint()
-    out.density = probability / (_unit_area(kind) * _area_scale(scene, light, n))
+    out.density = probability * relative / (_unit_area(kind) * _area_scale(scene, light, n))
     p += world_n * (wp.max(wp.abs(p)) * 9.5367431640625e-07)  # 8 ulp: a light often lies in the ceiling's plane
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
-    out.intensity = scene.light_radiance[light] / out.density
+    out.intensity = radiance / out.density
+    out.control = control_of(scene, light)
+    if _only_sampled(scene, out.control):
+        out.density = 0.0
     return out
 
 
@@ -142,14 +186,174 @@ def _axis(scene: SceneData, light: int) -> wp.vec3:
 
 
 @wp.func
+def _to_dome(scene: SceneData, light: int, direction: wp.vec3) -> wp.vec3:
+    """A direction of the world where a dome's texture has its pole along +z and begins at +x."""
+    d = wp.transpose(scene.light_axes[light]) * direction
+    return wp.vec3(-d[2], d[0], d[1])
+
+
+@wp.func
+def _from_dome(scene: SceneData, light: int, d: wp.vec3) -> wp.vec3:
+    return scene.light_axes[light] * wp.vec3(d[1], d[2], -d[0])
+
+
+@wp.func
+def _only_sampled(scene: SceneData, control: int) -> bool:
+    """Whether a light sees other surfaces than rays do, so that only `sample_light` may look for it."""
+    if control < 0:
+        return False
+    return (
+        scene.light_tables[0].controls.rows[control].shadows == 0
+        or scene.light_tables[0].controls.rows[control].shadowless >= 0
+    )
+
+
+@wp.func
+def _shaping(scene: SceneData, control: int, direction: wp.vec3) -> wp.vec3:
+    """Factor of the radiance that a light emits along a unit direction."""
+    if control < 0:
+        return wp.vec3(1.0)
+    return shaping_factor(scene.light_tables[0].controls.rows[control], scene.light_tables[0].grids, direction)
+
+
+@wp.func
+def _may_find(scene: SceneData, control: int, mesh: int, bsdf_density: float) -> bool:
+    """Whether a ray from a mesh (-1: the eye) counts the light it finds, `bsdf_density` being as for `lights_found`."""
+    if control < 0:
+        return True
+    if linked(scene.light_tables[0].controls, scene.light_tables[0].controls.rows[control].unlit, mesh):
+        return False
+    return bsdf_density < 0.0 or not _only_sampled(scene, control)
+
+
+@wp.func
+def arriving(scene: SceneData, control: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4) -> wp.vec3:
+    """How much of the light from a point on a light arrives at a point of a mesh.
+
+    Args:
+        scene: The scene.
+        control: Row of the light's `LightControl`; -1: only visibility counts.
+        position: The point, off its surface.
+        mesh: The mesh it belongs to.
+        seen: Whether the camera sees the point: only there may a light do without shadows.
+        target: Homogeneous; off its surface.
+    """
+    if control >= 0:
+        return _arriving_controlled(scene, control, position, mesh, seen, target)
+    if visible(scene, position, target):
+        return wp.vec3(1.0)
+    return wp.vec3(0.0)
+
+
+@wp.func(inline=False)
+def _arriving_controlled(
+    scene: SceneData, row: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4
+) -> wp.vec3:
+    control = scene.light_tables[0].controls.rows[row]
+    to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
+    factor = shaping_factor(control, scene.light_tables[0].grids, -wp.normalize(to_light))
+    if wp.max(factor) <= 0.0 or linked(scene.light_tables[0].controls, control.unlit, mesh):
+        return wp.vec3(0.0)
+    if seen and control.shadows == 0:
+        return factor
+    if control.shadowless < 0:
+        if visible(scene, position, target):
+            return factor
+        return wp.vec3(0.0)
+    if _visible_past(scene, control.shadowless, position, target):
+        return factor
+    return wp.vec3(0.0)
+
+
+@wp.func
+def _visible_past(scene: SceneData, shadowless: int, position: wp.vec3, target: wp.vec4) -> bool:
+    """`visible` as if the meshes of a link set were not there."""
+    origin = position
+    xyz = wp.vec3(target[0], target[1], target[2])
+    for _ in range(_CROSSINGS):
+        direction = xyz - origin * target[3]
+        hit = closest(scene, origin, direction, wp.where(target[3] == 0.0, 3.0e38, 0.999999))
+        if hit.triangle < 0:
+            return True
+        if not linked(scene.light_tables[0].controls, shadowless, scene.triangle_mesh[hit.triangle]):
+            return False
+        origin = _behind(scene, hit, direction)
+    return False
+
+
+@wp.func
+def _behind(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
+    """Where a ray goes on that passes through the surface it has hit."""
+    a = scene.points[scene.indices[3 * hit.triangle]]
+    b = scene.points[scene.indices[3 * hit.triangle + 1]]
+    c = scene.points[scene.indices[3 * hit.triangle + 2]]
+    return offset(a, b, c, hit.u, hit.v, wp.normalize(direction) - hit.normal)
+
+
+@wp.struct
+class Landing:
+    """Where a photon is reflected first."""
+
+    hit: Hit
+    weight: float  # of its flux; 0: it is lost
+
+
+@wp.func(inline=False)
+def land(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+    """The surface that reflects a photon, whose light may pass through some meshes and not light others.
+
+    Meshes it passes through are lit all the same, if they are linked: a coin decides, and doubles the flux.
+    """
+    out = Landing()
+    out.weight = 1.0
+    out.hit = first
+    control = scene.light_tables[0].controls.rows[row]
+    coin = u
+    for _ in range(_CROSSINGS):
+        if out.hit.triangle < 0:
+            return out
+        mesh = scene.triangle_mesh[out.hit.triangle]
+        lit = not linked(scene.light_tables[0].controls, control.unlit, mesh)
+        if not linked(scene.light_tables[0].controls, control.shadowless, mesh):
+            if not lit:
+                out.weight = 0.0
+            return out
+        if lit:
+            out.weight = 2.0 * out.weight
+            coin = 2.0 * coin
+            if coin < 1.0:
+                return out
+            coin -= 1.0
+        out.hit = closest(scene, _behind(scene, out.hit, direction), direction, 3.0e38)
+    out.weight = 0.0
+    return out
+
+
+@wp.func
 def _sample_point_or_direction(scene: SceneData, light: int, probability: float, u: wp.vec2) -> LightPoint:
     kind = scene.light_kind[light]
     out = LightPoint()
+    out.control = control_of(scene, light)
+    found = float(1.0)
+    if _only_sampled(scene, out.control):
+        found = 0.0
     out.normal = wp.vec4(0.0, 0.0, 0.0, 1.0)
     if kind == _POINT:
         p = scene.light_origin[light]
         out.position = wp.vec4(p[0], p[1], p[2], 1.0)
         out.intensity = scene.light_radiance[light] / probability
+        return out
+    texture = _texture_of(scene, light)
+    if texture >= 0:
+        cell = sample_cell(scene.light_tables[0].grids, texture, u)
+        local = cell_direction(scene.light_tables[0].grids, texture, cell)
+        xyz = wp.vec3(local[0], local[1], local[2])
+        d = _from_dome(scene, light, xyz)
+        out.position = wp.vec4(d[0], d[1], d[2], 0.0)
+        out.density = probability * local[3]
+        radiance = wp.cw_mul(scene.light_radiance[light], value_along(scene.light_tables[0].grids, texture, xyz))
+        out.intensity = radiance / out.density
+        out.density *= found
         return out
     cone = float(2.0)
     if kind == _DISTANT:
@@ -159,6 +363,7 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
     if cone > 0.0:
         out.density = probability / (2.0 * wp.pi * cone)
         out.intensity = scene.light_radiance[light] / out.density
+        out.density *= found
     else:
         out.intensity = scene.light_radiance[light] / probability
     return out
@@ -183,7 +388,26 @@ def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emissio
         out.origin = xyz
         out.direction = sampling.to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
         out.flux = point.intensity * wp.pi
+    if point.control >= 0:
+        out = _shaped(scene, point, u, out)
     return out
+
+
+@wp.func(inline=False)
+def _shaped(scene: SceneData, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
+    """The photon of a light with a control: in a direction that suits the shaping, or with the factor as a weight."""
+    control = scene.light_tables[0].controls.rows[point.control]
+    photon = unshaped
+    if control.photons >= 0:
+        local = cell_direction(
+            scene.light_tables[0].grids, control.photons, sample_cell(scene.light_tables[0].grids, control.photons, u)
+        )
+        photon.direction = wp.transpose(control.frame) * wp.vec3(local[0], local[1], local[2])
+        n = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
+        cosine = wp.max(0.0, point.normal[3] + wp.dot(n, photon.direction))
+        photon.flux = point.intensity * (cosine / local[3])
+    photon.flux = wp.cw_mul(photon.flux, shaping_factor(control, scene.light_tables[0].grids, photon.direction))
+    return photon
 
 
 @wp.func
@@ -224,6 +448,23 @@ def _hit_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3
 
 
 @wp.func
+def _face_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
+    """Radiance of a light with an area where a ray meets it, before shaping."""
+    texture = _texture_of(scene, light)
+    if texture < 0:
+        return scene.light_radiance[light]
+    place = _place(scene, light, origin, direction, t)
+    return wp.cw_mul(scene.light_radiance[light], value_at_place(scene.light_tables[0].grids, texture, place))
+
+
+@wp.func
+def _place(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
+    """Place in [0, 1]² on the texture of a rectangle that a ray meets at t: from +X to -X, from +Y to -Y."""
+    q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
+    return wp.vec2(0.5 - q[0], 0.5 - q[1])
+
+
+@wp.func
 def _weight(bsdf_density: float, light_density: float) -> float:
     """The balance heuristic (Veach 1997); 1 if the ray was no sample of a BSDF."""
     if bsdf_density < 0.0:
@@ -242,10 +483,21 @@ def _probability(scene: SceneData, emitter: int) -> float:
 def lights_along(
     scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float
 ) -> wp.vec3:
-    """Radiance of the analytic lights that a ray meets before t_max; of those at infinity too if it escapes.
+    """Radiance of the analytic lights that a camera's ray meets before t_max; of those at infinity too if it escapes.
 
-    Lights block nothing, so all along the ray count. `bsdf_density` is the density per solid angle with which
-    the direction was sampled, for weighting against `sample_light`; negative: no weighting.
+    Lights block nothing, so all along the ray count.
+    """
+    return lights_found(scene, origin, direction, t_max, escapes, bsdf_density, -1)
+
+
+@wp.func
+def lights_found(
+    scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float, mesh: int
+) -> wp.vec3:
+    """The same for a ray that leaves a mesh (-1: the eye), and sees the lights linked to it.
+
+    `bsdf_density` is the density per solid angle with which the direction was sampled, for weighting against
+    `sample_light`; negative: no weighting.
     """
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
@@ -254,46 +506,101 @@ def lights_along(
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
             hit = _hit_shape(scene, light, origin, direction)
-            if hit[3] > 0.0 and hit[3] < t_max:
+            if hit[3] > 0.0 and hit[3] < t_max and _may_find(scene, control_of(scene, light), mesh, bsdf_density):
                 n = wp.vec3(hit[0], hit[1], hit[2])
                 world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
                 cosine = -wp.dot(world_n, direction)
                 area = _unit_area(scene.light_kind[light]) * _area_scale(scene, light, n)
                 density = _probability(scene, scene.light_emitter[light]) * hit[3] * hit[3] / (area * cosine)
+                if _texture_of(scene, light) >= 0:
+                    place = _place(scene, light, origin, direction, hit[3])
+                    density *= place_density(scene.light_tables[0].grids, _texture_of(scene, light), place)
                 if cosine > 0.0:
-                    total += scene.light_radiance[light] * _weight(bsdf_density, density)
+                    radiance = _face_radiance(scene, light, origin, direction, hit[3])
+                    radiance = wp.cw_mul(radiance, _shaping(scene, control_of(scene, light), -direction))
+                    total += radiance * _weight(bsdf_density, density)
     if escapes:
         for light in range(scene.light_count):
-            kind = scene.light_kind[light]
-            cone = wp.where(kind == _DOME, 2.0, scene.light_angle[light])
-            apart = direction - _axis(scene, light)
-            if kind == _DOME or (kind == _DISTANT and 0.5 * wp.dot(apart, apart) < cone):
-                density = _probability(scene, scene.light_emitter[light]) / (2.0 * wp.pi * cone)
-                total += scene.light_radiance[light] * _weight(bsdf_density, density)
+            if scene.light_kind[light] >= _DISTANT and _may_find(scene, control_of(scene, light), mesh, bsdf_density):
+                total += _from_infinity(scene, light, direction, bsdf_density)
     return total
 
 
 @wp.func
-def lights_beyond(
-    scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, cosine: float, bound: float
-) -> wp.vec3:
-    """Radiance of the lights that a unit direction meets before t_max, times the share (1 - bound/G)⁺ that is cut.
+def _from_infinity(scene: SceneData, light: int, direction: wp.vec3, bsdf_density: float) -> wp.vec3:
+    """Radiance of a distant light or a dome along a unit direction, weighted."""
+    cone = wp.where(scene.light_kind[light] == _DOME, 2.0, scene.light_angle[light])
+    apart = direction - _axis(scene, light)
+    if scene.light_kind[light] == _DISTANT and 0.5 * wp.dot(apart, apart) >= cone:
+        return wp.vec3(0.0)
+    radiance = wp.cw_mul(scene.light_radiance[light], _shaping(scene, control_of(scene, light), -direction))
+    density = 1.0 / (2.0 * wp.pi * cone)
+    texture = _texture_of(scene, light)
+    if texture >= 0:
+        local = _to_dome(scene, light, direction)
+        radiance = wp.cw_mul(radiance, value_along(scene.light_tables[0].grids, texture, local))
+        density = direction_density(scene.light_tables[0].grids, texture, local)
+    return radiance * _weight(bsdf_density, _probability(scene, scene.light_emitter[light]) * density)
 
-    `cosine` is that of the direction at the origin.
+
+@wp.func
+def lights_beyond(
+    scene: SceneData,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    near: float,
+    cosine: float,
+    bound: float,
+    reach: float,
+    mesh: int,
+    seen: bool,
+) -> wp.vec3:
+    """Radiance of the lights that a unit direction meets, times the share (1 - bound/G)⁺ that the bound cuts.
+
+    Args:
+        scene: The scene.
+        origin: A point of a mesh, off its surface.
+        direction: Unit.
+        near: Distance to the first surface, or `reach`.
+        cosine: Of the direction at the origin.
+        bound: On G.
+        reach: Distance beyond which G cannot exceed the bound: lights that surfaces do not shadow count up to there.
+        mesh: The mesh at the origin.
+        seen: Whether the camera sees the origin.
     """
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
         shape = int(0)
-        while wp.bvh_query_next(query, shape, t_max):
+        while wp.bvh_query_next(query, shape, near):
             light = scene.shape_light[shape]
             hit = _hit_shape(scene, light, origin, direction)
-            if hit[3] > 0.0 and hit[3] < t_max:
-                world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
-                g = -wp.dot(world_n, direction) * cosine / (hit[3] * hit[3])
-                if g > bound:
-                    total += scene.light_radiance[light] * (1.0 - bound / g)
+            if hit[3] > 0.0 and hit[3] < near and _may_find(scene, control_of(scene, light), mesh, 0.0):
+                share = _cut(scene, light, hit, direction, cosine, bound)
+                if share > 0.0:
+                    radiance = _face_radiance(scene, light, origin, direction, hit[3])
+                    total += wp.cw_mul(radiance, _shaping(scene, control_of(scene, light), -direction)) * share
+    # One after the other and not in the query above: on CUDA two traversals at a time would share a stack.
+    for k in range(scene.only_sampled_count):
+        light = scene.light_tables[0].controls.sampled[k]
+        hit = _hit_shape(scene, light, origin, direction)
+        if hit[3] > 0.0 and hit[3] < reach:
+            share = _cut(scene, light, hit, direction, cosine, bound)
+            if share > 0.0:
+                p = origin + direction * (hit[3] * 0.99999)
+                arrives = arriving(scene, control_of(scene, light), origin, mesh, seen, wp.vec4(p[0], p[1], p[2], 1.0))
+                total += wp.cw_mul(_face_radiance(scene, light, origin, direction, hit[3]), arrives) * share
     return total
+
+
+@wp.func
+def _cut(scene: SceneData, light: int, hit: wp.vec4, direction: wp.vec3, cosine: float, bound: float) -> float:
+    """The share (1 - bound/G)⁺ for the place where a ray meets a light."""
+    world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
+    g = -wp.dot(world_n, direction) * cosine / (hit[3] * hit[3])
+    if g <= bound:
+        return 0.0
+    return 1.0 - bound / g
 
 
 @wp.func

@@ -145,6 +145,26 @@ class Mesh:
 
 
 @dataclass(frozen=True, eq=False)
+class Shaping:
+    """How a light's radiance depends on the direction of emission (UsdLux ShapingAPI), θ being its angle to the axis.
+
+    The axis is the light's -Z, whatever its shape. Factors multiply.
+    """
+
+    cone_angle: float = 180.0
+    """Half angle [degrees] of the cone outside which the light is dark."""
+    cone_softness: float = 0.0
+    """Part of that angle, from 0 to 1, over which the light fades out smoothly."""
+    focus: float = 0.0
+    """Exponent of the factor |cosθ|^focus."""
+    focus_tint: Color = (0.0, 0.0, 0.0)
+    """What the focus fades to: the factor is |cosθ|^focus + (1 - |cosθ|^focus) · focus_tint."""
+    profile: Floats | None = None
+    """Photometry of a lamp, [rows, columns]: the factor at the middle of cells that divide θ from 0° to 180° and the
+    azimuth from 0° to 360°, from the light's +X towards its +Y; interpolated between them."""
+
+
+@dataclass(frozen=True, eq=False)
 class Light:
     """A light that is not a surface of the scene: it casts light, blocks none, reflects none."""
 
@@ -163,6 +183,18 @@ class Light:
     length: float = 1.0
     angle: float = 0.53
     """Full angle of a DISTANT light's cone [degrees]."""
+    texture: Floats | None = None
+    """float32 [h, w, 3], multiplies the radiance of a RECT or DOME light, bilinear between texels. On a rectangle row 0
+    is at +Y and column 0 at +X: upright and unmirrored on the side that is lit. On a dome row 0 is around +Y, and the
+    columns go round from -Z by way of +X, +Z and -X."""
+    shaping: Shaping | None = None
+    """None: the same radiance in all directions."""
+    shadows: bool = True
+    """False: nothing shadows its direct light, what the camera sees of it; light by way of surfaces is always real."""
+    unlit: frozenset[int] = frozenset()
+    """Indices of the `Scene.meshes` that it does not light."""
+    shadowless: frozenset[int] = frozenset()
+    """Indices of the `Scene.meshes` that its light passes through as if they were not there."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
-from warp_ir.lights import emit, sample_light
+from warp_ir.lights import emit, land, sample_light
 from warp_ir.surface import albedo, closest
 
 wp.set_module_options({"enable_backward": False})
@@ -32,6 +32,7 @@ _MAX_REFLECTIVITY = 0.98
 """Likewise the mean reflectivity of fractional absorption."""
 # Dimensions 0-1: where on the light (the best pair), 2: which light, 3-4: direction, 5-6: place of a distant photon.
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
+_LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
 _UNLIMITED = 2**31 - 1
 
 
@@ -48,6 +49,7 @@ class VplBuffer:
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]
+    control: wp.array[wp.int32]  # [on_lights], rows of the lights' `LightControl`s or -1; one row if there are none
 
 
 @wp.struct
@@ -86,6 +88,8 @@ def _trace_paths(
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity * share
         vpls.bounce[i] = 0
+        if scene.control_count > 0:
+            vpls.control[i] = light.control
 
     photon = emit(
         scene,
@@ -98,8 +102,13 @@ def _trace_paths(
     flux = photon.flux
     dimension = int(_FIRST_BOUNCE_DIMENSION)
     bounce = int(1)
-    while bounce <= settings.max_bounces:
+    while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
+        if bounce == 1 and light.control >= 0:
+            coin = sampling.sample_1d(scene.sobol, i, _LANDING_DIMENSION, settings.scramble)
+            landing = land(scene, light.control, hit, direction, coin)
+            hit = landing.hit
+            flux = flux * landing.weight
         if hit.triangle < 0:
             break
         rho = albedo(scene, hit, scene.footprint)
@@ -160,7 +169,7 @@ def emit_vpls(
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
     if not scene.emits:
-        return _buffer(launcher, 0, 0)
+        return _buffer(scene, launcher, 0, 0)
     alive = survivors(paths, scene.mean_albedo)
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
@@ -173,16 +182,16 @@ def emit_vpls(
     # Two passes, count and store, give every path its rows without an atomic or a limit on its length.
     lengths = launcher.empty(paths, wp.int32)
     offsets = launcher.zeros(paths + 1, wp.int32)
-    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 0, _buffer(launcher, 0, 0), lengths])
+    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 0, _buffer(scene, launcher, 0, 0), lengths])
     wp.utils.array_scan(lengths, offsets[1:], inclusive=True)
-    vpls = _buffer(launcher, paths, int(offsets[paths:].numpy()[0]))
+    vpls = _buffer(scene, launcher, paths, int(offsets[paths:].numpy()[0]))
     launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 1, vpls, lengths])
     launcher.profile.counts["light_paths"] += paths
     launcher.profile.counts["vpls"] += vpls.count
     return vpls
 
 
-def _buffer(launcher: Launcher, on_lights: int, on_surfaces: int) -> Any:
+def _buffer(scene: DeviceScene, launcher: Launcher, on_lights: int, on_surfaces: int) -> Any:
     vpls = VplBuffer()
     vpls.on_lights, vpls.count = on_lights, on_lights + on_surfaces
     rows = max(vpls.count, 1)
@@ -190,6 +199,7 @@ def _buffer(launcher: Launcher, on_lights: int, on_surfaces: int) -> Any:
     vpls.normal = launcher.empty(rows, wp.vec4)
     vpls.intensity = launcher.empty(rows, wp.vec3)
     vpls.bounce = launcher.empty(rows, wp.int32)
+    vpls.control = launcher.empty(max(on_lights, 1) if scene.data.control_count > 0 else 1, wp.int32)
     return vpls
 
 
@@ -202,7 +212,8 @@ class Vpls:
     normals: npt.NDArray[np.float32]
     """[n, 3], unit; zero where the VPL shines the same in all directions."""
     intensity: npt.NDArray[np.float32]
-    """[n, 3], along the normal [W/sr]; where `directional`, the irradiance [W/m²] on a surface that faces it."""
+    """[n, 3], along the normal, before shaping [W/sr]; where `directional`, the irradiance [W/m²] on a surface that
+    faces it."""
     bounce: npt.NDArray[np.int32]
     """[n], reflections before: 0 is a point on a light."""
     directional: npt.NDArray[np.bool_]

@@ -43,10 +43,11 @@ def unit_shape(kind, u, v):
     return np.stack([u - 0.5, np.cos(phi), np.sin(phi)], axis=-1)
 
 
-def irradiance_at_origin(light: ir.Light, n: int = 600) -> float:
+def irradiance_at_origin(light: ir.Light, n: int = 600, factor=None) -> float:
     """E on the plane y = 0 at the origin: ∫ L cosθ cosθ' / d² dA over the light by the midpoint rule.
 
-    Written from the definition and independent of the renderer: areas and normals come from differences.
+    `factor(u, v, direction)` multiplies the radiance at parameters u, v towards the origin. Written from the definition
+    and independent of the renderer: areas and normals come from differences.
     """
     size = {
         LightKind.RECT: (light.width, light.height, 1.0),
@@ -75,7 +76,8 @@ def irradiance_at_origin(light: ir.Light, n: int = 600) -> float:
     d = np.sqrt(d2)
     cos_floor = np.maximum(p[..., 1] / d, 0.0)
     cos_light_area = np.maximum(np.sum(-p * area_normal, axis=-1) / d, 0.0)
-    return float(light.radiance[0] * np.sum(cos_floor * cos_light_area / d2))
+    towards = 1.0 if factor is None else factor(u, v, -p / d[..., None])
+    return float(light.radiance[0] * np.sum(towards * cos_floor * cos_light_area / d2))
 
 
 def rotation_x(degrees: float) -> np.ndarray:

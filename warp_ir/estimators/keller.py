@@ -23,9 +23,9 @@ import warp as wp
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.launch import Launcher
+from warp_ir.lights import arriving
 from warp_ir.sampling import iteration_scramble
 from warp_ir.settings import RenderSettings
-from warp_ir.surface import visible
 from warp_ir.vpl import VplBuffer, emit_vpls
 
 wp.set_module_options({"enable_backward": False})
@@ -68,8 +68,14 @@ def _accumulate(
             g = geometry_term(
                 position, gbuffer.normal[pixel], gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k]
             )
-            if g > 0.0 and visible(scene, position, vpls.position[k]):
-                irradiance = vpls.intensity[k] * wp.min(g, bound)
+            if g > 0.0:
+                control = int(-1)
+                if scene.control_count > 0 and k < vpls.on_lights:
+                    control = vpls.control[k]
+                arrives = arriving(
+                    scene, control, position, gbuffer.mesh[pixel], True, vpls.position[k]
+                )  # V, if no more
+                irradiance = wp.cw_mul(vpls.intensity[k], arrives) * wp.min(g, bound)
                 if vpls.bounce[k] == 0:
                     from_lights += irradiance
                 else:

@@ -16,9 +16,9 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
 from warp_ir.launch import Launcher
-from warp_ir.lights import LightPoint, lights_along, sample_light, surface_weight
+from warp_ir.lights import LightPoint, arriving, lights_found, sample_light, surface_weight
 from warp_ir.settings import RenderSettings
-from warp_ir.surface import albedo, closest, emission, visible
+from warp_ir.surface import albedo, closest, emission
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,7 +28,13 @@ _UNLIMITED = 2**31 - 1
 
 @wp.func
 def _light_at(
-    scene: SceneData, position: wp.vec3, normal: wp.vec3, shading_normal: wp.vec3, light: LightPoint
+    scene: SceneData,
+    position: wp.vec3,
+    normal: wp.vec3,
+    shading_normal: wp.vec3,
+    mesh: int,
+    seen: bool,
+    light: LightPoint,
 ) -> wp.vec3:
     """Weighted irradiance over π at a point from one sample of the lights."""
     xyz = wp.vec3(light.position[0], light.position[1], light.position[2])
@@ -39,7 +45,8 @@ def _light_at(
     at_light = light.normal[3] - wp.dot(wp.vec3(light.normal[0], light.normal[1], light.normal[2]), direction)
     if at_point <= 0.0 or at_light <= 0.0 or wp.dot(normal, direction) <= 0.0:
         return wp.vec3(0.0)
-    if not visible(scene, position, light.position):
+    arrives = arriving(scene, light.control, position, mesh, seen, light.position)
+    if wp.max(arrives) <= 0.0:
         return wp.vec3(0.0)
     # Densities per solid angle of the two ways to find this light; a delta light has only one (density 0).
     by_light = light.density * squared / at_light
@@ -47,7 +54,7 @@ def _light_at(
     weight = float(1.0)
     if light.density > 0.0:
         weight = by_light / (by_light + by_bsdf)
-    return light.intensity * (weight * at_point * at_light / (squared * wp.pi))
+    return wp.cw_mul(light.intensity, arrives) * (weight * at_point * at_light / (squared * wp.pi))
 
 
 @wp.kernel
@@ -70,13 +77,15 @@ def _trace_paths(
         position = gbuffer.position[pixel]
         normal = gbuffer.normal[pixel]
         shading_normal = gbuffer.shading_normal[pixel]
+        mesh = gbuffer.mesh[pixel]
         throughput = wp.vec3(1.0)  # after the reflection at the pixel, which is the film's
         bounce = int(0)  # reflections between this vertex's light and the camera, less one
         dimension = int(0)
         while wp.max(throughput) > 0.0:
             u = sampling.sample_1d(scene.sobol, 0, dimension, stream)
             light = sample_light(scene, u, sampling.sample_2d(scene.sobol, 0, dimension + 1, stream))
-            found = wp.cw_mul(throughput, _light_at(scene, position, normal, shading_normal, light))
+            lit = _light_at(scene, position, normal, shading_normal, mesh, bounce == 0, light)
+            found = wp.cw_mul(throughput, lit)
 
             # The way on: lights it meets count here, the surface it meets is the next vertex.
             u2 = sampling.sample_2d(scene.sobol, 0, dimension + 3, stream)
@@ -86,7 +95,7 @@ def _trace_paths(
             hit = closest(scene, position, direction, 3.0e38)
             if above:
                 reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
-                seen = lights_along(scene, position, direction, reach, hit.triangle < 0, density)
+                seen = lights_found(scene, position, direction, reach, hit.triangle < 0, density, mesh)
                 if hit.triangle >= 0:
                     emitted = emission(scene, hit, scene.footprint)
                     if wp.max(emitted) > 0.0:
@@ -108,6 +117,7 @@ def _trace_paths(
             position = hit.position
             normal = hit.normal
             shading_normal = hit.normal
+            mesh = scene.triangle_mesh[hit.triangle]
             dimension += 6
     direct[pixel] = once
     indirect[pixel] = more

@@ -59,6 +59,25 @@ def _spread(x: int) -> int:
     return (y | (y << 1)) & 0x55555555
 
 
+@wp.func
+def _sequence_index(settings: GatherSettings, pixel: int) -> int:
+    """Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels."""
+    column = (settings.first_column + pixel % settings.columns) & 0xFFFF
+    row = (settings.first_row + pixel // settings.columns) & 0xFFFF
+    return _spread(column) | (_spread(row) << 1)
+
+
+@wp.func
+def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
+    x = Receiver()
+    x.position = gbuffer.position[pixel]
+    x.normal = gbuffer.normal[pixel]
+    x.shading_normal = gbuffer.shading_normal[pixel]
+    x.mesh = gbuffer.mesh[pixel]
+    x.seen = True
+    return x
+
+
 @wp.kernel
 def _gather_pixels(
     first: int,
@@ -75,17 +94,11 @@ def _gather_pixels(
     once = wp.vec3(0.0)
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
-        # Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels.
-        column = (settings.first_column + pixel % settings.columns) & 0xFFFF
-        row = (settings.first_row + pixel // settings.columns) & 0xFFFF
-        index = _spread(column) | (_spread(row) << 1)
+        index = _sequence_index(settings, pixel)
         # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
         order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
         chosen_set = (index ^ int(order)) & 63  # of as many sets as there are
-        x = Receiver()
-        x.position = gbuffer.position[pixel]
-        x.normal = gbuffer.normal[pixel]
-        x.shading_normal = gbuffer.shading_normal[pixel]
+        x = _first_receiver(gbuffer, pixel)
         throughput = wp.vec3(1.0)
         reach = 1.0 / wp.sqrt(lights.bound)
         depth = int(0)
@@ -108,7 +121,7 @@ def _gather_pixels(
             cosine = wp.dot(direction, x.shading_normal)
             hit = closest(scene, x.position, direction, reach)
             near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound)
+            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound, reach, x.mesh, x.seen)
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
@@ -130,6 +143,8 @@ def _gather_pixels(
             x.position = hit.position
             x.normal = hit.normal
             x.shading_normal = hit.normal
+            x.mesh = scene.triangle_mesh[hit.triangle]
+            x.seen = False
             rays = settings.rays_after
             depth += 1
     direct[pixel] = once / wp.pi

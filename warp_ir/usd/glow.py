@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from pxr import Usd
+from pxr import Usd, UsdLux
 
 from warp_ir.scene import Floats, Material
 from warp_ir.usd import value
-from warp_ir.usd.light import Inputs, as_color, emission, warn_of_unread
+from warp_ir.usd.inputs import Inputs
+from warp_ir.usd.light import as_color, emission, warn_of_unread
+from warp_ir.usd.linking import is_linked
 from warp_ir.usd.report import Report, Unreadable
 
 
@@ -31,10 +33,10 @@ def glow(prim: Usd.Prim, materials: list[Material], area: float, time: Usd.TimeC
         if inputs.flag("normalize") and area > 0.0:
             radiance = radiance / area
         as_color(radiance)
+        _warn_of_unread(inputs)
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{trouble}; it does not emit as a light")
         return materials
-    warn_of_unread(inputs, None)
     if radiance.max() == 0.0:
         report.stats["lights_without_emission"] += 1
     mode = value.text(prim.GetAttribute("light:materialSyncMode"), time, "noMaterialResponse")
@@ -60,3 +62,17 @@ def _times(material: Material, factor: Floats) -> Material:
     red, green, blue = (factor * texture.outside).tolist()
     pixels = np.asarray(texture.pixels, np.float32) * factor.astype(np.float32)
     return replace(material, emission_texture=replace(texture, pixels=pixels, outside=(red, green, blue)))
+
+
+def _warn_of_unread(inputs: Inputs) -> None:
+    """What analytic lights have and surfaces do not."""
+    warn_of_unread(inputs)
+    prim = inputs.prim
+    if prim.HasAPI(UsdLux.ShapingAPI):
+        inputs.warn("a surface that emits is not shaped: it emits in all directions")
+    if prim.HasAPI(UsdLux.ShadowAPI) and not inputs.flag("shadow:enable", True):
+        inputs.warn("inputs:shadow:enable = false is not read for a surface that emits: it casts shadows")
+    if is_linked(prim):
+        inputs.warn("links of a surface that emits are not read: it lights everything")
+    if inputs.asset("texture:file") is not None:
+        inputs.warn("only rectangles and domes have textures; this one is ignored")

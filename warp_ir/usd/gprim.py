@@ -123,10 +123,11 @@ class _Builder:
             uvs = {name: corners[kept.face] for name, corners in uvs.items()}
         if len(triangles) == 0:
             return None
-        if prim.HasAPI(UsdLux.LightAPI):
+        lamp = prim if prim.HasAPI(UsdLux.LightAPI) else site.lamp
+        if lamp is not None:
             used, material = np.unique(material, return_inverse=True)
             area = 0.5 * float(np.linalg.norm(cross_products(points, triangles), axis=1).sum()) / copies
-            lit = glow(prim, [self._table.materials[i] for i in used], area, self._time, self._report)
+            lit = glow(lamp, [self._table.materials[i] for i in used], area, self._time, self._report)
             material = np.array([self._table.add(m) for m in lit], dtype=np.int32)[material]
             if not any(max(m.albedo) > 0.0 for m in lit):
                 colors = None  # a light that answers with no material reflects no colour either

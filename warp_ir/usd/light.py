@@ -1,6 +1,6 @@
 """UsdLux lights to `Light` records with their final radiance.
 
-    L = intensity · 2^exposure · color · blackbody(colorTemperature) · diffuse / sizeFactor
+    L = intensity · 2^exposure · color · blackbody(colorTemperature) · diffuse · texture · shaping / sizeFactor
 
 with sizeFactor = 1 unless `normalize`, where it is the world-space area (for a distant light the projected
 solid angle), so that the power no longer depends on the size. Nothing is multiplied by metersPerUnit.
@@ -8,13 +8,17 @@ solid angle), so that the power no longer depends on the size. Nothing is multip
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdLux
+from pxr import Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd import value
+from warp_ir.usd.inputs import Inputs
 from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.shaping import read_shaping
+from warp_ir.usd.texture import read_texture
 
 LIGHTS = {
     "RectLight": LightKind.RECT,
@@ -31,44 +35,11 @@ BRIGHTEST = 1e30
 """Radiance beyond this is a mistake in the file, and overflows float32 when it is squared or summed."""
 _PARALLEL = 1e-5
 """Full angle [degrees] of a distant light below which it is taken as parallel."""
-_THIN = 1e-3
+_THIN = 1e-4
 """Radius, as a part of the length, of the cylinder that stands for a line."""
-
-
-class Inputs:
-    """A light's inputs; files from before USD 21.02 have them without the prefix ``inputs:``.
-
-    Args:
-        prim: With LightAPI.
-        time: Of the values.
-        report: Where troubles go.
-    """
-
-    def __init__(self, prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> None:
-        self.prim, self.time, self._report = prim, time, report
-        # On a gprim `radius` and the like are geometry.
-        self._may_be_old = not prim.IsA(UsdGeom.Gprim)
-
-    def attribute(self, name: str) -> Usd.Attribute:
-        """The attribute that holds an input."""
-        current = self.prim.GetAttribute(f"inputs:{name}")
-        old = self.prim.GetAttribute(name)
-        if self._may_be_old and old and old.HasAuthoredValue() and not (current and current.HasAuthoredValue()):
-            self.warn("inputs authored in the old style, without 'inputs:', are used")
-            return old
-        return current
-
-    def number(self, name: str, default: float) -> float:
-        """A number input."""
-        return value.number(self.attribute(name), self.time, default)
-
-    def flag(self, name: str) -> bool:
-        """A truth value; False by default, as everywhere in UsdLux."""
-        return value.flag(self.attribute(name), self.time)
-
-    def warn(self, what: str) -> None:
-        """Say something about the light."""
-        self._report.warn(self.prim.GetPath(), what)
+_TEXELS = {LightKind.RECT: 2**20, LightKind.DOME: 2**23}
+"""Pixels to which light textures are averaged down: all that diffuse surfaces can see, and a sun of half a degree."""
+_BRIGHTEST_TEXEL = 1e12
 
 
 def emission(inputs: Inputs) -> Floats:
@@ -91,13 +62,15 @@ def emission(inputs: Inputs) -> Floats:
     return radiance
 
 
-def read_light(prim: Usd.Prim, kind: LightKind, matrix: Floats, time: Usd.TimeCode, report: Report) -> Light | None:
-    """The record of a light; None if it emits nothing.
+def read_light(
+    prim: Usd.Prim, kind: LightKind, matrices: Floats, time: Usd.TimeCode, report: Report
+) -> tuple[Light, ...]:
+    """The records of a light in all its places; none if it emits nothing.
 
     Args:
         prim: A light of one of `LIGHTS`.
         kind: Its kind.
-        matrix: world_from_light, [4, 4].
+        matrices: world_from_light, [k, 4, 4].
         time: Of the values.
         report: Where troubles go.
 
@@ -106,52 +79,129 @@ def read_light(prim: Usd.Prim, kind: LightKind, matrix: Floats, time: Usd.TimeCo
     """
     inputs = Inputs(prim, time, report)
     radiance = emission(inputs)
-    warn_of_unread(inputs, kind)
+    warn_of_unread(inputs)
     if radiance.max() == 0.0:
-        return None
-    if kind == LightKind.DOME:
-        return Light(str(prim.GetPath()), kind, as_color(radiance), matrix)
-    if kind == LightKind.DISTANT:
-        return _distant_light(inputs, radiance, matrix)
-    return _area_light(inputs, kind, radiance, matrix)
+        return ()
+    first = Light(
+        str(prim.GetPath()),
+        kind,
+        as_color(radiance),
+        texture=_texture(inputs, kind),
+        shaping=read_shaping(inputs, kind),
+        shadows=not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True),
+    )
+    place = _Placing(inputs, first, radiance)
+    found = (place(matrix) for matrix in matrices)
+    return tuple(light for light in found if light is not None)
 
 
-def _distant_light(inputs: Inputs, radiance: Floats, matrix: Floats) -> Light:
-    name, normalize = str(inputs.prim.GetPath()), inputs.flag("normalize")
-    angle = min(max(inputs.number("angle", 0.53), 0.0), 360.0)
-    solid_angle = projected_solid_angle(angle)
-    if angle < _PARALLEL:
-        angle, radiance = 0.0, radiance if normalize else radiance * solid_angle  # now an irradiance
-    elif normalize:
-        radiance = radiance / solid_angle
-    return Light(name, LightKind.DISTANT, as_color(radiance), matrix, angle=angle)
+class _Placing:
+    """A light, its dimensions read once, to be put in many places.
 
+    Args:
+        inputs: Of the light.
+        light: What is the same everywhere.
+        radiance: Of the light, before any normalisation.
+    """
 
-def _area_light(inputs: Inputs, kind: LightKind, radiance: Floats, matrix: Floats) -> Light | None:
-    prim, time, name = inputs.prim, inputs.time, str(inputs.prim.GetPath())
-    size = {name: abs(inputs.number(name, default)) for name, default in _DIMENSIONS[kind].items()}
-    area = _AREA[kind](matrix, size)
-    as_point = kind == LightKind.SPHERE and value.flag(prim.GetAttribute("treatAsPoint"), time)
-    as_line = kind == LightKind.CYLINDER and value.flag(prim.GetAttribute("treatAsLine"), time)
-    normalize = inputs.flag("normalize")
-    if as_point or (kind == LightKind.SPHERE and size["radius"] == 0.0):
-        if area == 0.0 and not normalize:
-            inputs.warn("a sphere light of radius 0 emits nothing; rendered as if 'normalize' were on")
-        # A sphere of area A has the intensity L A / 4 in every direction, whatever its radius.
-        intensity = radiance * (1.0 if normalize or area == 0.0 else area) / 4.0
-        return Light(name, LightKind.POINT, as_color(intensity), matrix)
-    if as_line or (kind == LightKind.CYLINDER and normalize and size["radius"] == 0.0):
-        inputs.warn("a line light is rendered as a thin cylinder of the same power")
-        power = 1.0 if normalize or area == 0.0 else area
-        size["radius"] = _THIN * size["length"]
+    def __init__(self, inputs: Inputs, light: Light, radiance: Floats) -> None:
+        self._inputs, self._light, self._radiance = inputs, light, radiance
+        prim, time, kind = inputs.prim, inputs.time, light.kind
+        self._size = {name: abs(inputs.number(name, default)) for name, default in _DIMENSIONS.get(kind, {}).items()}
+        self._normalize = inputs.flag("normalize")
+        self._as_point = kind == LightKind.SPHERE and value.flag(prim.GetAttribute("treatAsPoint"), time)
+        self._as_line = kind == LightKind.CYLINDER and value.flag(prim.GetAttribute("treatAsLine"), time)
+        self._angle = min(max(inputs.number("angle", 0.53), 0.0), 360.0) if kind == LightKind.DISTANT else 0.0
+
+    def __call__(self, matrix: Floats) -> Light | None:
+        """The light in one place; None if it emits nothing there.
+
+        Raises:
+            Unreadable: Its emission is not finite.
+        """
+        light = replace(self._light, world_from_light=matrix)
+        if light.kind == LightKind.DOME:
+            pole = _dome_from_pole(self._inputs)
+            return light if light.texture is None else replace(light, world_from_light=matrix @ pole)
+        if light.kind == LightKind.DISTANT:
+            return self._distant(light)
+        return self._shape(light)
+
+    def _distant(self, light: Light) -> Light:
+        angle, radiance = self._angle, self._radiance
+        solid_angle = projected_solid_angle(angle)
+        if angle < _PARALLEL:
+            angle, radiance = 0.0, radiance if self._normalize else radiance * solid_angle  # now an irradiance
+        elif self._normalize:
+            radiance = radiance / solid_angle
+        return replace(light, radiance=as_color(radiance), angle=angle)
+
+    def _shape(self, light: Light) -> Light | None:
+        inputs, kind, size, radiance, normalize = (
+            self._inputs,
+            light.kind,
+            dict(self._size),
+            self._radiance,
+            self._normalize,
+        )
+        matrix = light.world_from_light
         area = _AREA[kind](matrix, size)
-        radiance, normalize = radiance * power, True
-    if not (math.isfinite(area) and area > 0.0):
-        inputs.warn("its shape has no area, so it emits nothing")
+        if self._as_point or (kind == LightKind.SPHERE and size["radius"] == 0.0):
+            if area == 0.0 and not normalize:
+                inputs.warn("a sphere light of radius 0 emits nothing; rendered as if 'normalize' were on")
+            # A sphere of area A has the intensity L A / 4 in every direction, whatever its radius.
+            intensity = radiance * (1.0 if normalize or area == 0.0 else area) / 4.0
+            return replace(light, kind=LightKind.POINT, radiance=as_color(intensity))
+        if self._as_line or (kind == LightKind.CYLINDER and normalize and size["radius"] == 0.0):
+            # The limit of a thin cylinder of the same power: closer to it than anything that is not on it can see.
+            power = 1.0 if normalize or area == 0.0 else area
+            size["radius"] = _THIN * size["length"]
+            area = _AREA[kind](matrix, size)
+            radiance, normalize = radiance * power, True
+        if not (math.isfinite(area) and area > 0.0):
+            inputs.warn("its shape has no area, so it emits nothing")
+            return None
+        if normalize:
+            radiance = radiance / area
+        return replace(
+            light,
+            radiance=as_color(radiance),
+            width=size.get("width", 1.0),
+            height=size.get("height", 1.0),
+            radius=size.get("radius", 0.5),
+            length=size.get("length", 1.0),
+        )
+
+
+def _texture(inputs: Inputs, kind: LightKind) -> Floats | None:
+    """The image that multiplies a light's radiance, float32 [h, w, 3], as `Light` wants it."""
+    asset = inputs.asset("texture:file")
+    if asset is None:
         return None
-    if normalize:
-        radiance = radiance / area
-    return Light(name, kind, as_color(radiance), matrix, **size)
+    if kind not in (LightKind.RECT, LightKind.DOME):
+        inputs.warn("only rectangles and domes have textures; this one is ignored")
+        return None
+    layout = inputs.text("texture:format", "automatic") if kind == LightKind.DOME else "latlong"
+    if layout not in ("automatic", "latlong"):
+        inputs.warn(f"dome textures of the format '{layout}' are not read: it emits its constant colour")
+        return None
+    space = inputs.attribute("texture:file").GetColorSpace()
+    try:
+        image = read_texture(asset, space if space in ("raw", "sRGB") else "auto", _TEXELS[kind])
+    except Unreadable as trouble:
+        inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
+        return None
+    return np.clip(image.rgb, 0.0, _BRIGHTEST_TEXEL)
+
+
+def _dome_from_pole(inputs: Inputs) -> Floats:
+    """dome_from_texture, [4, 4]: a texture's pole is +Y; DomeLight_1 may have it along +Z, as its poleAxis says."""
+    axis = value.text(inputs.prim.GetAttribute("poleAxis"), inputs.time, "Y")
+    if axis == "scene":
+        axis = str(UsdGeom.GetStageUpAxis(inputs.prim.GetStage()))
+    if axis != "Z":
+        return np.eye(4)
+    return np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def projected_solid_angle(angle: float) -> float:
@@ -163,48 +213,19 @@ def projected_solid_angle(angle: float) -> float:
     return math.pi * (sine2 if theta <= 0.5 * math.pi else 2.0 - sine2)
 
 
-def warn_of_unread(inputs: Inputs, kind: LightKind | None) -> None:
-    """Name what a light asks for and this loader does not read yet.
+def warn_of_unread(inputs: Inputs) -> None:
+    """Name what a light asks for and this loader does not read.
 
-    Args:
-        inputs: Of the light.
-        kind: None for a gprim that emits.
+    Raises:
+        Unreadable: An input has the wrong type or is not finite.
     """
-    prim, time = inputs.prim, inputs.time
-    if _names_file(inputs.attribute("texture:file"), time):
-        inputs.warn("light textures are not read yet: it emits its constant colour")
-    if prim.HasAPI(UsdLux.ShapingAPI) and _is_shaped(inputs, kind):
-        inputs.warn("shaping (cone, focus, IES) is not read yet: it emits in all directions")
-    if prim.HasAPI(UsdLux.ShadowAPI) and not value.flag(prim.GetAttribute("inputs:shadow:enable"), time, True):
-        inputs.warn("inputs:shadow:enable = false is not read yet: it casts shadows")
-    light = UsdLux.LightAPI(prim)
-    for name, collection in (
-        ("lightLink", light.GetLightLinkCollectionAPI()),
-        ("shadowLink", light.GetShadowLinkCollectionAPI()),
-    ):
-        everything = value.flag(collection.GetIncludeRootAttr(), time, True)
-        if not everything or collection.GetExcludesRel().HasAuthoredTargets():
-            inputs.warn(f"{name} is not read yet: it concerns everything")
-    if light.GetFiltersRel().HasAuthoredTargets():
-        inputs.warn("light filters are not read yet")
-    if prim.GetRelationship("portals").HasAuthoredTargets():
-        inputs.warn("portals are not read yet; they would only guide the sampling")
-
-
-def _is_shaped(inputs: Inputs, kind: LightKind | None) -> bool:
-    """Whether ShapingAPI changes anything: flat lights emit into a hemisphere anyway."""
-    whole = 90.0 if kind in (LightKind.RECT, LightKind.DISK) else 180.0
-    return (
-        inputs.number("shaping:cone:angle", 90.0) < whole
-        or inputs.number("shaping:cone:softness", 0.0) > 0.0
-        or inputs.number("shaping:focus", 0.0) > 0.0
-        or _names_file(inputs.attribute("shaping:ies:file"), inputs.time)
-    )
-
-
-def _names_file(attribute: Usd.Attribute, time: Usd.TimeCode) -> bool:
-    asset = value.raw(attribute, time)
-    return isinstance(asset, Sdf.AssetPath) and asset.path != ""
+    prim = inputs.prim
+    if prim.HasAPI(UsdLux.ShadowAPI):
+        color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
+        if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
+            inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
+    if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()):
+        inputs.warn("light filters are not read")
 
 
 def as_color(radiance: Floats) -> Color:

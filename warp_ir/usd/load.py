@@ -14,6 +14,7 @@ from warp_ir.scene import InputError, Light, LightKind, Material, Mesh, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
+from warp_ir.usd.linking import link
 from warp_ir.usd.motion import Motion
 from warp_ir.usd.network import Images
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
@@ -256,7 +257,7 @@ class StageReader:
         stats["textures"] = len(textures)
         stats["texels"] = sum(texture.pixels.shape[0] * texture.pixels.shape[1] for texture in textures)
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
-        scene = Scene(meshes, materials, lights, name=report.source)
+        scene = Scene(meshes, materials, link(self.stage, lights, meshes), name=report.source)
         if view is None:
             along = "-Z" if self._axis == "Y" else "+Y"
             report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
@@ -327,16 +328,14 @@ def _join(one: _Geometry, other: _Geometry) -> _Geometry:
 
 
 def _lights(sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> tuple[Light, ...]:
-    lights = []
+    lights: list[Light] = []
     for site in sites:
         kind = LIGHTS[site.prim.GetPrimTypeInfo().GetSchemaTypeName()]
         try:
-            light = read_light(site.prim, kind, site.matrices[0], time, report)
+            found = read_light(site.prim, kind, site.matrices, time, report)
         except Unreadable as trouble:
             report.warn(site.prim.GetPath(), f"{trouble}; the light is skipped")
             continue
-        if light is None:
-            report.stats["lights_without_emission"] += 1
-        else:
-            lights.append(light)
+        report.stats["lights_without_emission"] += len(site.matrices) - len(found)
+        lights += found
     return tuple(lights)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
@@ -16,6 +16,8 @@ from warp_ir.usd.report import Report, Unreadable
 
 _DEPTH = 16
 """Deepest nesting of point instancers that is followed."""
+_LIGHT_COPIES = 100_000
+"""Most copies of one light."""
 _COPIES = 50_000_000
 """Most copies of one gprim: what exceeds it is a mistake in the file, not a scene."""
 
@@ -35,6 +37,8 @@ class Site:
     """world_from_prim, float64 [k, 4, 4]."""
     colors: Floats | None = None
     """displayColor that an instancer gives to each copy, float64 [k, 3]; the prim's own is stronger."""
+    lamp: Usd.Prim | None = None
+    """The GeometryLight that makes a gprim emit, if there is one."""
 
 
 @dataclass(eq=False)
@@ -73,12 +77,14 @@ class _Walk:
         self._transforms = UsdGeom.XformCache(time)
         self._found = Found()
         self._unread: Counter[str] = Counter()
+        self._lamps: list[Usd.Prim] = []
 
     def run(self) -> Found:
         root = _Visit(self._stage.GetPseudoRoot(), np.eye(4)[None], None, None, ())
         pending = [root]
         while pending:  # a stack of our own: hierarchies may be deeper than Python's
             pending += reversed(self._visit(pending.pop()))
+        self._light_geometry()
         return self._found
 
     def _visit(self, visit: _Visit) -> list[_Visit]:
@@ -105,7 +111,12 @@ class _Walk:
                 self._found.shapes.append(site)
         elif kind in LIGHTS:
             if self._is_drawn(prim, name):
-                self._add_light(site, visit)
+                self._add_light(site)
+        elif kind == "GeometryLight":
+            if self._is_drawn(prim, name):
+                self._lamps.append(prim)
+        elif kind == "PortalLight":
+            report.warn(prim.GetPath(), "portals are ignored: they would only guide the sampling of a dome")
         elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
             if self._is_drawn(prim, name):
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
@@ -150,11 +161,23 @@ class _Walk:
                 return False
         return True
 
-    def _add_light(self, site: Site, visit: _Visit) -> None:
-        if visit.instancers:
-            self._report.warn(site.prim.GetPath(), "lights in the prototypes of a point instancer are not read yet")
+    def _add_light(self, site: Site) -> None:
+        if len(site.matrices) > _LIGHT_COPIES:
+            self._report.warn(site.prim.GetPath(), f"{len(site.matrices)} copies of a light: too many, it is left out")
         else:
             self._found.lights.append(site)
+
+    def _light_geometry(self) -> None:
+        """Gives gprims to the deprecated GeometryLights that refer to them."""
+        lamps: dict[Sdf.Path, Usd.Prim] = {}
+        for lamp in self._lamps:
+            targets = value.targets(lamp.GetRelationship("geometry"))
+            lamps.update(dict.fromkeys(targets, lamp))
+            if not any(site.prim.GetPath() in targets for site in self._found.shapes):
+                self._report.warn(lamp.GetPath(), "its geometry is nothing that is drawn: it emits nothing")
+        if lamps:
+            shapes = [replace(site, lamp=lamps.get(site.prim.GetPath())) for site in self._found.shapes]
+            self._found.shapes = shapes
 
     def _instances(self, visit: _Visit, matrices: Floats, purpose: object | None) -> list[_Visit]:
         """The prototypes of a point instancer, each with all its places."""

@@ -1,0 +1,51 @@
+"""The inputs of a light."""
+
+from pxr import Sdf, Usd, UsdGeom
+
+from warp_ir.usd import value
+from warp_ir.usd.report import Report
+
+
+class Inputs:
+    """A light's inputs; files from before USD 21.02 have them without the prefix ``inputs:``.
+
+    Args:
+        prim: With LightAPI.
+        time: Of the values.
+        report: Where troubles go.
+    """
+
+    def __init__(self, prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> None:
+        self.prim, self.time, self._report = prim, time, report
+        # On a gprim `radius` and the like are geometry.
+        self._may_be_old = not prim.IsA(UsdGeom.Gprim)
+
+    def attribute(self, name: str) -> Usd.Attribute:
+        """The attribute that holds an input."""
+        current = self.prim.GetAttribute(f"inputs:{name}")
+        old = self.prim.GetAttribute(name)
+        if self._may_be_old and old and old.HasAuthoredValue() and not (current and current.HasAuthoredValue()):
+            self.warn("inputs authored in the old style, without 'inputs:', are used")
+            return old
+        return current
+
+    def number(self, name: str, default: float) -> float:
+        """A number input."""
+        return value.number(self.attribute(name), self.time, default)
+
+    def flag(self, name: str, default: bool = False) -> bool:
+        """A truth value; False by default, as almost everywhere in UsdLux."""
+        return value.flag(self.attribute(name), self.time, default)
+
+    def text(self, name: str, default: str = "") -> str:
+        """A token."""
+        return value.text(self.attribute(name), self.time, default)
+
+    def asset(self, name: str) -> Sdf.AssetPath | None:
+        """A file, if one is named."""
+        path = value.raw(self.attribute(name), self.time)
+        return path if isinstance(path, Sdf.AssetPath) and path.path != "" else None
+
+    def warn(self, what: str) -> None:
+        """Say something about the light."""
+        self._report.warn(self.prim.GetPath(), what)
