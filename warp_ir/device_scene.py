@@ -84,6 +84,7 @@ class SceneData:
     emitter_count: int
     emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or _TRIANGLE_EMITTER
+    emitter_density: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
     triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no surface emits
 
@@ -571,14 +572,16 @@ def _upload_emitters(
     kinds: list[npt.NDArray[np.int32]] = []
     items: list[npt.NDArray[np.int32]] = []
     powers: list[npt.NDArray[np.float64]] = []
+    areas: list[npt.NDArray[np.float64]] = []
     radiance = data.light_radiance.numpy()
     axes = data.light_axes.numpy()
     for k, light in enumerate(scene.lights):
-        power = float(np.mean(radiance[k], dtype=np.float64)) * _power_per_radiance(light, axes[k], data.radius)
-        power *= gain[k]
+        extent = _power_per_radiance(light, axes[k], data.radius)
+        power = float(np.mean(radiance[k], dtype=np.float64)) * extent * gain[k]
         kinds.append(np.array([light.kind], np.int32))
         items.append(np.array([k], np.int32))
         powers.append(np.array([power]))
+        areas.append(np.array([extent / math.pi if light.kind <= LightKind.CYLINDER else np.inf]))
 
     emission = np.array([m.emission for m in scene.materials], np.float64).reshape(-1, 3).mean(axis=1)
     first = 0
@@ -590,16 +593,19 @@ def _upload_emitters(
             sides = 2.0 if mesh.double_sided else 1.0
             kinds.append(np.full(len(glowing), _TRIANGLE_EMITTER, np.int32))
             items.append((first + glowing).astype(np.int32))
+            areas.append(sides * area)
             powers.append(math.pi * sides * area * _mean_emission(scene, mesh, glowing, area, data.footprint))
         first += len(mesh.triangles)
 
-    kind, item, power = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers))
+    tables = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers, areas))
+    kind, item, power, spread = tables
     on = power > 0.0
-    kind, item, power = kind[on], item[on], power[on]
+    kind, item, power, spread = kind[on], item[on], power[on], spread[on]
     data.emitter_count = len(power)
     cdf = np.concatenate([[0.0], np.cumsum(power / power.sum())]) if len(power) else np.array([0.0, 1.0])
     cdf[-1] = 1.0
     data.emitter_cdf = launcher.array(cdf, wp.float32)
+    data.emitter_density = launcher.array(np.diff(cdf) / spread if len(power) else [0.0], wp.float32)
     data.emitter_kind = launcher.array(kind.astype(np.int32) if len(kind) else [0], wp.int32)
     data.emitter_item = launcher.array(item.astype(np.int32) if len(item) else [0], wp.int32)
 

@@ -19,7 +19,7 @@ from warp_ir.bvh import _on_cuda
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
-from warp_ir.lights import arriving
+from warp_ir.lights import Bound, arriving, bound_on
 from warp_ir.vpl import VplBuffer
 
 wp.set_module_options({"enable_backward": False})
@@ -53,7 +53,7 @@ class VplSets:
     sets: int
     blocks: int  # per set
     count: int  # VPLs in all sets
-    bound: float
+    bound: Bound
     rows: wp.array[vec16]
     shaped: int  # 1: there are rows of shaping
     shapes: wp.array[vec16]
@@ -253,10 +253,20 @@ def _gather_one_by_one(
 
 
 @wp.func
+def _bound_of(lit: VplSets, vpl: int, normal: wp.vec4) -> float:
+    """The bound on G for one VPL."""
+    if normal[3] == 1.0:
+        return _UNBOUNDED
+    if vpl < lit.vpls.on_lights:
+        return bound_on(lit.bound, lit.vpls.density[vpl])
+    return lit.bound.least
+
+
+@wp.func
 def _weigh_one(scene: SceneData, lit: VplSets, x: Receiver, slot: int) -> float:
     vpl = lit.order[slot]
     normal = lit.vpls.normal[vpl]
-    bound = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
+    bound = _bound_of(lit, vpl, normal)
     weight = luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
     if lit.shaped == 1 and weight > 0.0:
         weight *= _emphasis_of(scene, lit, vpl, x.position)
@@ -309,16 +319,18 @@ def _pack(first: int, lit: VplSets) -> None:
         position = wp.vec4(0.0)
         normal = wp.vec4(0.0)
         strength = float(0.0)
+        bound = float(_UNBOUNDED)
         if slot < lit.count:
             vpl = lit.order[slot]
             position = lit.vpls.position[vpl]
             normal = lit.vpls.normal[vpl]
             strength = luminance(lit.vpls.intensity[vpl])
+            bound = _bound_of(lit, vpl, normal)
         for k in range(4):
             lit.rows[_ROWS * i + k][lane] = position[k]
             lit.rows[_ROWS * i + 4 + k][lane] = normal[k]
         lit.rows[_ROWS * i + 8][lane] = strength
-        lit.rows[_ROWS * i + 9][lane] = wp.where(normal[3] == 1.0, _UNBOUNDED, lit.bound)
+        lit.rows[_ROWS * i + 9][lane] = bound
 
 
 @wp.kernel
@@ -362,7 +374,8 @@ def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any
     lights, surfaces = _divide(vpls, vpls.on_lights), _divide(vpls, vpls.count - vpls.on_lights)
     weighed = LANES * max(lights.blocks + surfaces.blocks, 1)
     for lit, begin in ((lights, 0), (surfaces, vpls.on_lights)):
-        lit.bound = math.pi * weighed / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
+        lit.bound.least = math.pi * weighed / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
+        lit.bound.per_density = math.pi * LANES * lights.blocks / _AREAS
         keys = launcher.empty(max(2 * lit.count, 1), wp.int32)
         lit.order = launcher.empty(max(2 * lit.count, 1), wp.int32)  # the sort wants room for a second copy
         launcher.launch(_sort_key, lit.count, [lit, begin, scene.extent, keys])

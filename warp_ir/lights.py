@@ -45,7 +45,30 @@ class LightPoint:
     normal: wp.vec4
     intensity: wp.vec3  # radiance / density: W/sr for a place, W/m² for a direction
     density: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
+    emitter: int
     control: int  # row of its `LightControl`; -1: it has none
+
+
+@wp.struct
+class Bound:
+    """A bound on G, higher for VPLs on lights where they lie closer together than they do on average."""
+
+    least: float
+    per_density: float  # times the density of the samples on a light, per area
+
+
+@wp.func
+def bound_on(bound: Bound, density: float) -> float:
+    """The bound for VPLs on a light whose points are sampled with some density per area."""
+    return wp.max(bound.least, bound.per_density * density)
+
+
+@wp.func
+def cut_share(bound: float, g: float) -> float:
+    """What the bound takes of a geometry term: (1 - bound/G)⁺."""
+    if g <= bound:
+        return 0.0
+    return 1.0 - bound / g
 
 
 @wp.struct
@@ -71,11 +94,15 @@ def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
     probability = scene.emitter_cdf[low + 1] - scene.emitter_cdf[low]
     rest = (u_pick - scene.emitter_cdf[low]) / probability  # uniform again, for what is left to choose
     item = scene.emitter_item[low]
+    out = LightPoint()
     if scene.emitter_kind[low] == _TRIANGLE:
-        return _sample_triangle(scene, item, probability, rest, u)
-    if scene.emitter_kind[low] <= _CYLINDER:
-        return _sample_shape(scene, item, probability, u)
-    return _sample_point_or_direction(scene, item, probability, u)
+        out = _sample_triangle(scene, item, probability, rest, u)
+    elif scene.emitter_kind[low] <= _CYLINDER:
+        out = _sample_shape(scene, item, probability, u)
+    else:
+        out = _sample_point_or_direction(scene, item, probability, u)
+    out.emitter = low
+    return out
 
 
 @wp.func
@@ -550,7 +577,7 @@ def lights_beyond(
     direction: wp.vec3,
     near: float,
     cosine: float,
-    bound: float,
+    bound: Bound,
     reach: float,
     mesh: int,
     seen: bool,
@@ -594,13 +621,11 @@ def lights_beyond(
 
 
 @wp.func
-def _cut(scene: SceneData, light: int, hit: wp.vec4, direction: wp.vec3, cosine: float, bound: float) -> float:
+def _cut(scene: SceneData, light: int, hit: wp.vec4, direction: wp.vec3, cosine: float, bound: Bound) -> float:
     """The share (1 - bound/G)⁺ for the place where a ray meets a light."""
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
     g = -wp.dot(world_n, direction) * cosine / (hit[3] * hit[3])
-    if g <= bound:
-        return 0.0
-    return 1.0 - bound / g
+    return cut_share(bound_on(bound, scene.emitter_density[scene.light_emitter[light]]), g)
 
 
 @wp.func

@@ -42,7 +42,9 @@ class RenderSettings:
         None, "stop when the estimated relative RMS error of the picture is below this"
     )
     light_paths: int | None = _setting(
-        None, "light paths per iteration, 4096 for vpl and 512 for keller by default; a power of two is best"
+        None,
+        "light paths per iteration, a power of two is best; by default 512 for keller, for vpl 1024 to 4096 by the"
+        " number of pixels",
     )
     max_bounces: int | None = _setting(
         None, "longest chain of reflections: 0 = direct light only, 1 = one more, ...; unlimited by default"
@@ -106,8 +108,14 @@ class RenderSettings:
 
     @property
     def path_count(self) -> int:
-        """Light paths per iteration: as set; else few for `keller`, to which every VPL at every pixel is a ray."""
-        return self.light_paths or (512 if self.estimator == "keller" else 4096)
+        """Light paths per iteration: as set; else few for `keller`, to which every VPL at every pixel is a ray.
+
+        For `vpl` one for every eight pixels within limits: more would outlast what they light.
+        """
+        if self.light_paths is not None:
+            return self.light_paths
+        pixels = self.width * (self.height or self.width)
+        return 512 if self.estimator == "keller" else 1 << (min(max(pixels // 8, 1024), 4096).bit_length() - 1)
 
     @property
     def path_end(self) -> str:

@@ -49,6 +49,7 @@ class VplBuffer:
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]
+    density: wp.array[wp.float32]  # [on_lights], of samples per area of the light; 0 where it has no area
     control: wp.array[wp.int32]  # [on_lights], rows of the lights' `LightControl`s or -1; one row if there are none
 
 
@@ -88,6 +89,7 @@ def _trace_paths(
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity * share
         vpls.bounce[i] = 0
+        vpls.density[i] = scene.emitter_density[light.emitter]
         if scene.control_count > 0:
             vpls.control[i] = light.control
 
@@ -199,6 +201,7 @@ def _buffer(scene: DeviceScene, launcher: Launcher, on_lights: int, on_surfaces:
     vpls.normal = launcher.empty(rows, wp.vec4)
     vpls.intensity = launcher.empty(rows, wp.vec3)
     vpls.bounce = launcher.empty(rows, wp.int32)
+    vpls.density = launcher.empty(max(on_lights, 1), wp.float32)
     vpls.control = launcher.empty(max(on_lights, 1) if scene.data.control_count > 0 else 1, wp.int32)
     return vpls
 

@@ -366,12 +366,12 @@ def test_spots_leave_the_rest_of_the_room_alone(shaping):
     assert variances[0] < 4.0 * variances[1]
 
 
-@pytest.mark.parametrize("estimator", ["keller", "path"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_lines_are_thin_cylinders(estimator, device):
     """E = 2 r L (a/(h² + a²) + atan(a/h)/h) at the height h below the middle of a line of half length a.
 
-    That is what the loader makes of treatAsLine: a cylinder whose radius is 1e-4 of its length. Not `vpl`: so close to
-    the light its bound takes hold, and the rays that give back what it takes hardly ever find a line.
+    That is what the loader makes of treatAsLine: a cylinder whose radius is 1e-4 of its length. A bound that knew
+    nothing of its size would take the light, and rays that are to give it back hardly ever find a line.
     """
     a, h, radius = 0.75, 2.0, 1.5e-4
     line = ir.Light(
