@@ -19,11 +19,14 @@ from warp_ir.usd.walk import Site, walk
 _COUNTED = (
     "meshes",
     "triangles",
+    "triangles_seen",
     "materials",
     "lights",
     "instances",
     "native_instances",
     "point_instances",
+    "prototypes",
+    "prototype_places",
     "prims_invisible",
     "prims_other_purpose",
     "degenerate_faces",
@@ -99,7 +102,8 @@ def _load(
     view = None if chosen is None else read_camera(chosen, time, report)
     axis = up_axis(stage, report)
     found = walk(stage, time, purposes, report)
-    meshes, materials = build_meshes(found.shapes, time, report, levels)
+    geometry = build_meshes(found.shapes, time, report, levels)
+    meshes, materials = geometry.meshes, geometry.materials
     lights = _lights(found.lights, time, report)
     if not meshes:
         hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
@@ -109,9 +113,11 @@ def _load(
         lights = (Light("default dome", LightKind.DOME, (1.0, 1.0, 1.0)),)
     stats = dict.fromkeys(_COUNTED, 0) | report.stats
     stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
-    stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
     stats["instances"] = stats["native_instances"] + stats["point_instances"]
-    scene = Scene(meshes, materials, lights, name=report.source)
+    stats["prototypes"] = len(geometry.instances)
+    stats["prototype_places"] = sum(len(group.matrices) for group in geometry.instances)
+    scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
+    stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
     if view is None:
         along = "-Z" if axis == "Y" else "+Y"
         report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
