@@ -44,6 +44,16 @@ def describe(scene: Scene, path: str) -> dict[str, Any]:
         },
         "meshes": len(scene.meshes),
         "triangles": scene.triangle_count,
+        "triangles_seen": scene.triangles_seen,
+        "prototypes": [
+            {
+                "name": group.name,
+                "meshes": len(group.meshes),
+                "triangles": sum(len(scene.meshes[k].triangles) for k in group.meshes),
+                "instances": len(group.matrices),
+            }
+            for group in scene.instances
+        ],
         "bounds": [_floats(lower), _floats(upper)],
         "lights": [
             {"name": light.name, "kind": light.kind.name.lower(), "radiance": _floats(light.radiance)}
@@ -87,7 +97,13 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     )
     _list("other cameras", [name for name in facts["cameras"] if name != camera["name"]], most)
     _row("meshes", facts["meshes"])
-    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit")
+    seen = f"; {facts['triangles_seen']} are seen" if facts["prototypes"] else ""
+    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit{seen}")
+    _list(
+        "prototypes",
+        [f"{p['instances']} instances of {p['triangles']} triangles  {p['name']}" for p in facts["prototypes"]],
+        most,
+    )
     _row("bounds", f"({_numbers(lower)}) to ({_numbers(upper)})")
     _list("lights", lights, most)
     _list("materials", materials, most)
