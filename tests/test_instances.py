@@ -69,6 +69,18 @@ def test_copies_are_measured_as_written_out():
     assert scene.mean_albedo() == pytest.approx(flat.mean_albedo(), rel=1e-6)
 
 
+def test_colors_of_corners_stay_with_their_corners():
+    """Also in mirrored copies, whose corners are turned round."""
+    points, triangles = sphere(level=1)
+    colors = (0.5 + 0.4 * points)[triangles].astype(np.float32)
+    ball = dataclasses.replace(mesh("ball", points, triangles), colors=colors)
+    matrices = scattered(9)
+    flat = ir.Scene((ball,), instances=(Instances("ball", (0,), matrices),)).flat().meshes[0]
+    corners = flat.points[flat.triangles].reshape(9, -1, 3)
+    local = (corners - matrices[:, None, :3, 3]) @ np.linalg.inv(matrices[:, :3, :3]).transpose(0, 2, 1)
+    np.testing.assert_allclose(flat.colors.reshape(9, -1, 3), 0.5 + 0.4 * local, atol=1e-6)
+
+
 @pytest.mark.parametrize("uneven", [False, True])
 def test_bounds_and_areas_of_many_copies(uneven):
     """However the search for the outermost copies goes, it ends with the box around all of their points."""

@@ -288,9 +288,10 @@ def _written_out(mesh: Mesh, group: Instances, materials: Sequence[Material]) ->
     """An instanced mesh as one in the world: all its copies, one after the other."""
     copies = len(group.matrices)
     points, triangles, normals = place(mesh.points, mesh.triangles, mesh.normals, group.matrices)
-    # What else a mesh has, it has per triangle.
+    mirrored = np.linalg.det(group.matrices[:, :3, :3]) < 0.0
+    # What else a mesh has, it has per triangle, or per corner of each.
     tables: dict[str, Any] = {
-        f.name: _repeated(getattr(mesh, f.name), copies)
+        f.name: _repeated(getattr(mesh, f.name), mirrored)
         for f in fields(mesh)
         if f.name not in ("points", "triangles", "normals", "bare")
     }
@@ -300,13 +301,17 @@ def _written_out(mesh: Mesh, group: Instances, materials: Sequence[Material]) ->
             albedo = np.array([m.albedo for m in materials], np.float32)[mesh.material]
             own = np.repeat(albedo[:, None], 3, axis=1)
         given = group.colors.astype(np.float32)[:, None, None]
-        colors = np.where(mesh.bare[None, :, None, None], given, own[None])
-        tables["colors"] = colors.reshape(-1, 3, 3)
+        own = _repeated(own, mirrored).reshape(copies, -1, 3, 3)
+        tables["colors"] = np.where(mesh.bare[None, :, None, None], given, own).reshape(-1, 3, 3)
     return replace(mesh, points=points, triangles=triangles, normals=normals, bare=None, **tables)
 
 
-def _repeated(value: Any, times: int) -> Any:
-    """A table, or each of a mapping of tables, so many times one after the other; anything else as it is."""
+def _repeated(value: Any, mirrored: Any) -> Any:
+    """A table, or each of a mapping of tables, once for every copy; anything else as it is.
+
+    Rows [m, 3, c] are of corners, which `place` turns round in mirrored copies.
+    """
     if isinstance(value, np.ndarray):
-        return np.concatenate([value] * times)
-    return {key: _repeated(v, times) for key, v in value.items()} if isinstance(value, Mapping) else value
+        turned = value[:, ::-1] if value.ndim == 3 else value
+        return np.concatenate([turned if is_mirrored else value for is_mirrored in mirrored])
+    return {key: _repeated(v, mirrored) for key, v in value.items()} if isinstance(value, Mapping) else value

@@ -211,6 +211,9 @@ class _Builder:
         copies = len(matrices)
         points, triangles, normals = self._placed(shape, matrices, shared=shared)
         material, colors = np.tile(look.material, copies), self._colors(look, given, copies)
+        mirrored = np.repeat(np.linalg.det(matrices[:, :3, :3]) < 0.0, len(shape.triangles))
+        if colors is not None and mirrored.any():
+            colors[mirrored] = colors[mirrored][:, ::-1]  # `place` has turned the corners round
         bare = np.tile(look.bare, copies) if shared and look.bare is not None else None
         if (np.linalg.det(matrices[:, :3, :3]) == 0.0).any():
             # A flattened copy keeps the triangles that still have an area.
