@@ -154,12 +154,20 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
     for k in range(3):
         weight = wp.where(k == 0, hit.u, wp.where(k == 1, hit.v, 1.0 - hit.u - hit.v))
         n = scene.corner_normals[row + k]
+        corner = scene.points[scene.indices[3 * hit.triangle + k]]
+        if hit.instance >= 0:
+            n = wp.normalize(wp.transpose(scene.instances[hit.instance].inverse) * n)
+            corner = scene.instance_axes[hit.instance] * corner + scene.instances[hit.instance].centre
         n = wp.where(wp.dot(n, hit.normal) < 0.0, -n, n)
-        below = wp.dot(scene.points[scene.indices[3 * hit.triangle + k]] - hit.position, n)
+        below = wp.dot(corner - hit.position, n)
         rise += weight * wp.max(below, 0.0) * n
     # What stands on the surface, or close above it, must stay above the point.
-    if wp.length_sq(rise) > 0.0 and intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
-        return wp.vec3(0.0)
+    if wp.length_sq(rise) > 0.0:
+        if intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
+            return wp.vec3(0.0)
+        if scene.instance_count > 0:
+            if intersect_instances(scene.two_level, hit.position, rise, 2.0, True).triangle >= 0:
+                return wp.vec3(0.0)
     return rise
 
 
