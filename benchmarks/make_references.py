@@ -213,7 +213,7 @@ def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = 
         "integrator": {"type": "volpath", "max_depth": depth, "rr_depth": 6, "hide_emitters": not emissive},
         "sensor": _sensor(mi, scene.camera, scene.extent, width, height),
     }
-    for k, mesh in enumerate(scene.meshes):
+    for k, mesh in enumerate(scene.flat().meshes):
         for index in np.unique(mesh.material):
             result[f"mesh_{k}_{index}"] = _mesh(mi, mesh, scene, int(index))
     for k, light in enumerate(scene.lights):

@@ -19,7 +19,7 @@ KERNEL_MODULES = [
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES, ids=lambda m: m.__name__)
-@pytest.mark.parametrize("arch", [75, 90])
+@pytest.mark.parametrize("arch", [pytest.param(75, marks=pytest.mark.slow), 90])
 def test_kernels_compile_for_cuda(module, arch, tmp_path):
     """Turing and Hopper machine code comes out of every module."""
     wp.compile_aot_module(module, arch=arch, module_dir=tmp_path, use_ptx=False)

@@ -1,11 +1,15 @@
 """Native and point instancing: as if every instance had been written out."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from warp_ir import InputError, Scene, load_usd
+from warp_ir.image import write_image
+from warp_ir.usd.load import StageReader
 
 TRIANGLE = """
         point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
@@ -229,13 +233,255 @@ def test_colors_per_instance(tmp_path):
 
 
 def test_a_scene_that_cannot_fit_is_refused_before_it_is_allocated(tmp_path):
-    """Nested instancers that multiply to hundreds of millions are an input error."""
+    """Nested instancers that multiply to thousands of millions are an input error."""
     many = f"int[] protoIndices = {[0] * 3000}\n point3f[] positions = {[(0, 0, 0)] * 3000}"
-    inner = f"""def PointInstancer "Proto" {{
-        rel prototypes = </P/Proto/S>
-        {many}
-        def Sphere "S" {{
-        }}
-    }}"""
+    path, inner = "/P/Proto/Proto/Proto/S", 'def Sphere "S" {\n}'
+    for _ in range(3):
+        inner = f'def PointInstancer "Proto" {{\n rel prototypes = <{path}>\n {many}\n {inner}\n}}'
+        path = path.rpartition("/")[0]
     with pytest.raises(InputError, match="too many"):
         load(tmp_path, instancer(many, inner))
+
+
+@pytest.fixture
+def shared(monkeypatch):
+    """All prototypes in more than one place are stored once, however small they are."""
+    monkeypatch.setattr("warp_ir.usd.sharing.MOST_WRITTEN", 0)
+
+
+MOVED = 'double3 xformOp:translate = ({}, {}, {})\n uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+CUBE = 'def Cube "{}" {{\n {}\n }}'
+TWO = "int[] protoIndices = [0, 0]\n point3f[] positions = [(0, 0, 0), (10, 0, 0)]"
+STAGES = {
+    "point": instancer(
+        "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(0, 0, 0), (5, 0, 0), (0, 7, 0)]\n"
+        "quatf[] orientationsf = [(1, 0, 0, 0), (0.6, 0, 0.8, 0), (0.8, 0.6, 0, 0)]\n"
+        "float3[] scales = [(1, 1, 1), (2, -3, 1), (0.5, 1, 2)]"
+    ),
+    "colored": instancer(
+        TWO + '\n color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")',
+        f"""def Xform "Proto" {{
+            {CUBE.format("A", "")}
+            {CUBE.format("B", "color3f[] primvars:displayColor = [(0, 0, 1)]")}
+        }}""",
+    ),
+    "masked": instancer(
+        "int[] protoIndices = [0, 0, 0, 0]\n point3f[] positions = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)]\n"
+        "int64[] ids = [7, 8, 9, 10]\n int64[] invisibleIds = [8]"
+    ),
+    "collapsed": instancer(
+        "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(0, 0, 0), (5, 0, 0), (9, 0, 0)]\n"
+        "float3[] scales = [(1, 1, 1), (1, 1, 0), (0, 0, 0)]",
+        CUBE.format("Proto", ""),
+    ),
+    "nested": instancer(
+        TWO + '\n color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")',
+        f"""def PointInstancer "Proto" {{
+            {MOVED.format(0, 0, 5)}
+            rel prototypes = </P/Proto/M>
+            int[] protoIndices = [0, 0]
+            point3f[] positions = [(0, 0, 0), (3, 0, 0)]
+            {CUBE.format("M", MOVED.format(0, 1, 0))}
+        }}""",
+    ),
+    "native in point": f'class "N" {{ {CUBE.format("C", "")}\n }}\n'
+    + instancer(
+        TWO,
+        f"""def Xform "Proto" {{
+            {MOVED.format(0, 0, 10)}
+            def Xform "I" (inherits = </N>
+                instanceable = true) {{ {MOVED.format(0, 4, 0)} }}
+            def Xform "J" (inherits = </N>
+                instanceable = true) {{ {MOVED.format(0, 8, 0)} }}
+        }}""",
+    ),
+    "point in native": f'class "N" {{ def PointInstancer "P" {{ rel prototypes = </N/P/C>\n {TWO}\n'
+    f"{CUBE.format('C', '')}\n }}\n }}\n"
+    + "".join(
+        f'def Xform "I{k}" (inherits = </N>\n instanceable = true) {{ {MOVED.format(0, 5 * k, 0)} }}\n'
+        for k in range(3)
+    ),
+    "native, colored above": f'class "N" {{ {CUBE.format("C", "")}\n }}\n'
+    + "".join(
+        f'def Xform "X{k}" {{ color3f[] primvars:displayColor = [({k % 2}, 1, 0)]\n'
+        f'def Xform "I" (inherits = </N>\n instanceable = true) {{ {MOVED.format(0, 5 * k, 0)} }}\n }}\n'
+        for k in range(5)
+    ),
+    "emissive": instancer(
+        TWO,
+        'def Cube "Proto" (prepend apiSchemas = ["MeshLightAPI"]) {\n float inputs:intensity = 3\n }',
+    ),
+}
+
+
+def surfaces(scene: Scene) -> np.ndarray:
+    """Corners, albedo and emission of all triangles, [m, 15], sorted."""
+    rows = []
+    for mesh in scene.meshes:
+        albedo = np.array([m.albedo for m in scene.materials])[mesh.material]
+        if mesh.colors is not None:
+            albedo = mesh.colors.mean(axis=1)
+        emission = np.array([m.emission for m in scene.materials])[mesh.material]
+        rows.append(np.concatenate([mesh.points[mesh.triangles].reshape(-1, 9), albedo, emission], axis=1))
+    found = np.concatenate(rows)
+    return found[np.lexsort(found.round(6).T)]
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_stored_once_is_the_same_as_written_out(tmp_path, name, monkeypatch):
+    """Every triangle of every instance has the place, the colour and the light it has when all is written out."""
+    flat = load(tmp_path, STAGES[name])
+    monkeypatch.setattr("warp_ir.usd.sharing.MOST_WRITTEN", 0)
+    scene = load(tmp_path, STAGES[name])
+    assert flat.instances == () and bool(scene.instances) == (name != "emissive")
+    np.testing.assert_allclose(surfaces(scene.flat()), surfaces(flat), atol=1e-12)
+    np.testing.assert_allclose(scene.bounds(), flat.bounds(), atol=1e-12)
+    assert scene.warnings == flat.warnings and scene.materials == flat.materials
+    assert scene.stats["triangles_seen"] == flat.stats["triangles"]
+    assert scene.stats["prototype_places"] == sum(len(group.matrices) for group in scene.instances)
+
+
+UVS = ((0.1, 0.2), (0.3, 0.4), (0.5, 0.7))
+TEXTURED = """
+def Material "Look" {
+    token outputs:surface.connect = </Look/S.outputs:surface>
+    def Shader "S" {
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </Look/T.outputs:rgb>
+        token outputs:surface
+    }
+    def Shader "T" {
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @a.png@
+        float2 inputs:st.connect = </Look/R.outputs:result>
+        float3 outputs:rgb
+    }
+    def Shader "R" {
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }
+}
+""" + instancer(
+    "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(0, 0, 0), (5, 0, 0), (0, 7, 0)]\n"
+    "float3[] scales = [(1, 1, 1), (2, -3, 1), (1, 2, 0)]",
+    f"""def Mesh "Proto" (prepend apiSchemas = ["MaterialBindingAPI"]) {{{TRIANGLE}
+        rel material:binding = </Look>
+        texCoord2f[] primvars:st = {list(UVS)} (interpolation = "vertex")
+    }}""",
+)
+
+
+def test_texture_coordinates_stay_with_their_corners(tmp_path, monkeypatch):
+    """In instances, in those written out, mirrored or flattened: what the prim's points have, their copies have."""
+    write_image(tmp_path / "a.png", np.full((2, 2, 3), 0.5, np.float32))
+    scenes = [load(tmp_path, TEXTURED)]
+    monkeypatch.setattr("warp_ir.usd.sharing.MOST_WRITTEN", 0)
+    scenes.append(load(tmp_path, TEXTURED))
+    assert len(scenes[1].instances[0].matrices) == 2 and scenes[1].stats["textures"] == 1
+    for scene in (scenes[0], scenes[1].flat()):
+        points = np.concatenate([mesh.points[mesh.triangles].reshape(-1, 3) for mesh in scene.meshes])
+        uvs = np.concatenate([mesh.uvs["st"].reshape(-1, 2) for mesh in scene.meshes])
+        assert len(points) == 9
+        for x, y, width, height in ((0, 0, 1, 1), (5, 0, 2, -3), (0, 7, 1, 2)):
+            for corner, uv in zip(((x, y, 0), (x + width, y, 0), (x, y + height, 0)), UVS, strict=True):
+                (found,) = uvs[(points == corner).all(axis=1)]
+                np.testing.assert_allclose(found, uv, atol=1e-6)
+
+
+@pytest.mark.usefixtures("shared")
+def test_instances_that_move_join_those_that_do_not(tmp_path):
+    """At every moment all is where it is when written out; what stands still is read once."""
+    moves = "point3f[] positions.timeSamples = { 1: [(0, 0, 0), (0, 3, 0)], 3: [(4, 0, 0), (0, 9, 0)] }"
+    red = "color3f[] primvars:displayColor = [(1, 0, 0)]"
+    text = (
+        instancer("int[] protoIndices = [0, 0]\n" + moves, CUBE.format("Proto", red), "Q")
+        + "\n"
+        + STAGES["point"]
+        + "\n"
+        + CUBE.format("Alone", MOVED.format(0, 0, -9))
+    )
+    (tmp_path / "stage.usda").write_text("#usda 1.0\n" + text)
+    reader = StageReader(tmp_path / "stage.usda")
+    first, second = reader.read(1.0), reader.read(2.0)
+    assert [len(scene.instances) for scene in (first, second)] == [2, 2]
+    assert sum(a is b for a, b in zip(first.instances, second.instances, strict=True)) == 1
+    for time, scene in ((1.0, first), (2.0, second)):
+        alone = load(tmp_path, text, time=time)
+        np.testing.assert_allclose(surfaces(scene.flat()), surfaces(alone.flat()), atol=1e-12)
+        (group,) = [g for g in scene.instances if g.name.startswith("/Q/")]
+        assert [scene.meshes[k].name for k in group.meshes] == ["/Q/Proto"]
+        np.testing.assert_allclose(group.matrices[:, :2, 3], [(2 * time - 2, 0), (0, 3 * time)], atol=1e-12)
+        assert scene.stats["prototypes"] == 2 and scene.stats["prototype_places"] == 5
+
+
+@pytest.mark.usefixtures("shared")
+def test_what_is_stored(tmp_path):
+    """One mesh for each gprim of a prototype, whoever places it, and the places."""
+    scene = load(tmp_path, STAGES["point in native"])
+    assert len(scene.meshes) == 1 and len(scene.instances) == 1
+    assert scene.instances[0].matrices[:, :3, 3].tolist() == [[0, y, 0] for y in (0, 5, 10)]
+    assert len(scene.meshes[0].triangles) == 2 * 12  # two cubes take less than two places for each of three
+    # Two colours above, five places: two looks of one geometry.
+    scene = load(tmp_path, STAGES["native, colored above"])
+    assert [len(group.matrices) for group in scene.instances] == [3, 2]
+    assert scene.meshes[0].points is scene.meshes[1].points
+
+
+def test_large_prototypes_are_stored_once_and_small_ones_written_out(tmp_path):
+    """A million triangles are written out, those that come in the smallest numbers first."""
+    many = f"int[] protoIndices = {[0] * 500}\n point3f[] positions = {[(3 * k, 0, 0) for k in range(500)]}"
+    text = instancer(many, CUBE.format("Proto", ""), "A") + instancer(many, 'def Sphere "Proto" {\n }', "B")
+    scene = load(tmp_path, text)
+    assert [mesh.name for mesh in scene.meshes] == ["/A/Proto", "/B/Proto"]
+    assert len(scene.meshes[0].triangles) == 500 * 12 and scene.instances[0].meshes == (1,)
+    assert scene.stats["prototypes"] == 1 and scene.stats["prototype_places"] == 500
+    assert scene.stats["triangles"] == 6000 + len(scene.meshes[1].triangles)
+    assert scene.stats["triangles_seen"] == 500 * (12 + len(scene.meshes[1].triangles))
+
+
+def write_many(path: Path, count: int) -> None:
+    """A stage with so many turned instances of a sphere, each of its own colour."""
+    from pxr import Sdf, Usd, UsdGeom, Vt
+
+    random = np.random.default_rng(0)
+    stage = Usd.Stage.CreateNew(str(path))
+    instances = UsdGeom.PointInstancer.Define(stage, "/P")
+    UsdGeom.Sphere.Define(stage, "/P/Proto")
+    instances.GetPrototypesRel().AddTarget("/P/Proto")
+    instances.GetProtoIndicesAttr().Set(Vt.IntArray(count))
+    positions = random.random((count, 3)) * [count**0.5, 4.0, count**0.5]
+    instances.GetPositionsAttr().Set(Vt.Vec3fArray.FromNumpy(positions.astype(np.float32)))
+    turns = random.normal(size=(count, 4)).astype(np.float32)
+    instances.GetOrientationsfAttr().Set(Vt.QuatfArray.FromNumpy(turns))
+    colors = UsdGeom.PrimvarsAPI(instances).CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "vertex")
+    colors.Set(Vt.Vec3fArray.FromNumpy(random.random((count, 3)).astype(np.float32)))
+    stage.GetRootLayer().Save()
+
+
+def test_many_instances_take_the_memory_of_their_places(tmp_path):
+    """A hundred thousand instances are an array of matrices and one of colours: 140 bytes each."""
+    write_many(tmp_path / "many.usdc", 100_000)
+    scene = load_usd(tmp_path / "many.usdc")
+    (group,) = scene.instances
+    assert group.matrices.nbytes + group.colors.nbytes == 140 * 100_000
+    assert len(scene.meshes) == 1 and scene.triangles_seen == 100_000 * scene.triangle_count
+
+
+@pytest.mark.slow
+def test_a_million_instances_load_in_seconds(tmp_path):
+    """Read, uploaded and ready for rays in less than a minute and 2 GB, slow machines included."""
+    write_many(tmp_path / "many.usdc", 1_000_000)
+    code = f"""
+import resource, time
+import warp_ir as ir
+start = time.perf_counter()
+scene = ir.load_usd({str(tmp_path / "many.usdc")!r})
+from warp_ir.device_scene import upload_scene
+from warp_ir.launch import Launcher
+upload_scene(scene, Launcher("cpu"))
+print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    seconds, memory = (float(x) for x in out.split()[-2:])
+    assert seconds < 60.0 and memory < 2.0e9, out

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warp_ir.scene import Camera as Camera
     from warp_ir.scene import InputError as InputError
+    from warp_ir.scene import Instances as Instances
     from warp_ir.scene import Light as Light
     from warp_ir.scene import LightKind as LightKind
     from warp_ir.scene import Material as Material
@@ -31,6 +32,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Camera": "scene",
     "InputError": "scene",
+    "Instances": "scene",
     "Light": "scene",
     "LightKind": "scene",
     "Material": "scene",

@@ -3,6 +3,8 @@
 On the device the scene lives in its own frame: centred on the middle of its bounding box and scaled by
 a power of two until its extent is between 1/2 and 1. Radiance does not change when a scene is scaled,
 so nothing else has to know; and a scene in millimetres, or far from the origin, is as exact as any.
+
+A prototype lives in a frame of its own, made the same way; its instances are matrices from there to the scene's.
 """
 
 import math
@@ -15,18 +17,23 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir import sampling
-from warp_ir.bvh import Bvh, build_bvh
+from warp_ir.bvh import Bvh, Instance, TwoLevel, build_bvhs, build_instance_tree
 from warp_ir.grid import GridList, GridTables, cell_measure
 from warp_ir.launch import Launcher
 from warp_ir.light_control import ControlTables, upload_controls
-from warp_ir.scene import Camera, InputError, Light, LightKind, Material, Mesh, Projection, Scene, Texture
+from warp_ir.placing import boxes, cofactors
+from warp_ir.scene import Camera, InputError, Instances, Light, LightKind, Material, Mesh, Projection, Scene, Texture
 from warp_ir.settings import RenderSettings
 from warp_ir.texture import TextureTable, mean_on_triangles, upload_textures
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_TRIANGLES = 200_000_000
-"""Above this a scene is refused before anything is allocated (~200 bytes a triangle)."""
+"""Above this a scene is refused before anything is allocated."""
+_BYTES_PER_TRIANGLE = 200
+_BYTES_PER_INSTANCE = 400
+INSTANCE_COLOR = -2
+"""In `SceneData.triangle_colors`: the triangle has the colour of its instance."""
 _PATCHES = 2**14
 """Where light is reflected, textures are means over as many patches of the scene's surface: VPLs are no denser."""
 _LARGEST_UV = 1.0e6
@@ -58,13 +65,20 @@ class SceneData:
     """Geometry, materials and emitters. Empty tables hold one unused row; the counts tell."""
 
     bvh: Bvh  # every surface; never empty
+    instance_count: int
+    two_level: wp.array[TwoLevel]  # `bvh` and the tree over the instances: one row
+    instances: wp.array[Instance]
+    instance_axes: wp.array[wp.mat33]  # device_from_local, around Instance.centre
+    instance_colors: wp.array[wp.vec3]  # one row if none has any
     triangle_count: int
-    points: wp.array[wp.vec3]
+    points: wp.array[wp.vec3]  # in the device frame; those of a prototype in its own
     indices: wp.array[wp.int32]  # [3 m]
     triangle_material: wp.array[wp.int32]  # [m]
     triangle_mesh: wp.array[wp.int32]  # [m], index into Scene.meshes
     triangle_normals: wp.array[wp.int32]  # [m], first of its three rows in corner_normals; -1: faceted
-    triangle_colors: wp.array[wp.int32]  # [m], first of its three rows in corner_colors; -1: the material's
+    triangle_colors: wp.array[
+        wp.int32
+    ]  # [m], first of its three rows in corner_colors; -1: the material's; -2: the instance's
     corner_normals: wp.array[wp.vec3]
     corner_colors: wp.array[wp.vec3]
     albedo: wp.array[wp.vec3]  # [materials]
@@ -200,10 +214,10 @@ def upload_moments(
     with launcher.phase("upload"):
         checked = {id(mesh) for other in previous for mesh in other.source.meshes}
         for scene in scenes:
-            _check(scene, checked)
+            _check(scene, launcher, checked)
             checked |= {id(mesh) for mesh in scene.meshes}
-        boxes = [scene.bounds() for scene in scenes]
-        lower, upper = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        bounds = [scene.bounds() for scene in scenes]
+        lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
         done: list[DeviceScene] = []
         for scene in scenes:
             done.append(_upload(scene, lower, upper, launcher, [*done, *previous]))
@@ -215,9 +229,8 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
     extent = float(np.linalg.norm(upper - lower))
     if not np.isfinite(extent):
         raise InputError("scene: its extent is too large for a float")
-    # Rooms of exactly 2^k units must not jump between scales by rounding: frexp is exact.
-    scale = 2.0 ** -math.frexp(extent)[1] if extent > 0.0 else 1.0
-    frame = DeviceFrame(0.5 * (lower + upper), scale)
+    frame = _frame(lower, upper)
+    scale = frame.scale
     # All of a scene is in its frame: in another one nothing can be used again.
     others = [o for o in others if o.frame.scale == scale and (o.frame.origin == frame.origin).all()]
     surfaces = next((o for o in others if _same_surfaces(o.source, scene)), None)
@@ -232,13 +245,15 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
     area = scene.area() * scale**2
     data.footprint = math.sqrt(area / _PATCHES)
     data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
-    mesh = surfaces.keep[0] if surfaces is not None else _upload_surfaces(scene, frame, data, launcher)
+    stored, numbers = _arranged(scene)
+    owners = surfaces.keep[0] if surfaces is not None else _upload_surfaces(stored, numbers, frame, data, launcher)
+    # Links name meshes by their numbers in the scene, not by where they are stored.
     shapes, gain = _upload_lights(scene, frame, data, launcher)
-    _upload_emitters(scene, gain, frame, data, launcher)
+    _upload_emitters(stored, gain, frame, data, launcher)
     data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
     itself = launcher.array([data], SceneData)
     data.address = wp.uint64(itself.ptr)
-    colors = [m.colors.max() for m in scene.meshes if m.colors is not None and len(m.colors)]
+    colors = [x.colors.max() for x in (*scene.meshes, *scene.instances) if x.colors is not None and len(x.colors)]
     used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
     colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
     return DeviceScene(
@@ -249,7 +264,7 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
         mean_albedo=scene.mean_albedo(),
         max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
         emits=data.emitter_count > 0,
-        keep=(mesh, shapes, itself),
+        keep=(owners, shapes, itself),
         source=scene,
     )
 
@@ -259,8 +274,16 @@ def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
 
 
 def _same_surfaces(one: Scene, other: Scene) -> bool:
-    """Whether two scenes have the same meshes and equal materials."""
-    return _same(one.meshes, other.meshes) and (one.materials is other.materials or one.materials == other.materials)
+    """Whether two scenes have the same meshes and instances, and equal materials."""
+    same = _same(one.meshes, other.meshes) and _same(one.instances, other.instances)
+    return same and (one.materials is other.materials or one.materials == other.materials)
+
+
+def _frame(lower: Any, upper: Any) -> DeviceFrame:
+    """The frame in which a box is centred, and its diagonal between 1/2 and 1."""
+    extent = float(np.linalg.norm(upper - lower))
+    # Rooms of exactly 2^k units must not jump between scales by rounding: frexp is exact.
+    return DeviceFrame(0.5 * (lower + upper), 2.0 ** -math.frexp(extent)[1] if extent > 0.0 else 1.0)
 
 
 def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> Any:
@@ -302,15 +325,27 @@ def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) ->
     return out
 
 
-def _check(scene: Scene, checked: Collection[int]) -> None:
+def _check(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
     """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here, but meshes `checked` before."""
-    if scene.triangle_count > MAX_TRIANGLES:
-        raise InputError(f"scene: {scene.triangle_count} triangles; the limit is {MAX_TRIANGLES}")
     for mesh in scene.meshes:
         if id(mesh) not in checked:
             _check_mesh(mesh)
         if len(mesh.triangles) and not 0 <= mesh.material.min() <= mesh.material.max() < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
+    _check_instances(scene)
+    glowing = _glowing(scene)
+    written = [(g, k) for g in scene.instances for k in g.meshes if k in glowing]
+    again = [(len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in written]
+    triangles, instances = scene.triangle_count + sum(again), sum(len(g.matrices) for g in scene.instances)
+    if triangles > MAX_TRIANGLES:
+        copies = f", {sum(again)} of them copies of instances that emit" if again else ""
+        raise InputError(f"scene: {triangles} triangles{copies}; the limit is {MAX_TRIANGLES}")
+    needed = _BYTES_PER_TRIANGLE * triangles + _BYTES_PER_INSTANCE * instances
+    if needed > launcher.memory():
+        raise InputError(
+            f"scene: {triangles} triangles and {instances} instances need about {needed / 2**30:.1f} GiB,"
+            f" {launcher.device} has {launcher.memory() / 2**30:.1f}"
+        )
     for material in scene.materials:
         _check_material(material)
         if not all(0.0 <= a <= 1.0 for a in material.albedo):
@@ -354,6 +389,26 @@ def _check_material(material: Material) -> None:
             demand(top <= 1.0 and min(bounded.outside) >= 0.0, f"texture {bounded.name}: values must lie in [0, 1]")
 
 
+def _check_instances(scene: Scene) -> None:
+    taken: set[int] = set()
+    for group in scene.instances:
+        count = len(group.matrices)
+
+        def demand(good: Any, what: str, name: str = group.name) -> None:
+            if not good:
+                raise InputError(f"{name}: {what}")
+
+        demand(all(0 <= k < len(scene.meshes) for k in group.meshes), f"meshes outside 0..{len(scene.meshes) - 1}")
+        demand(len({*group.meshes} - taken) == len(group.meshes), "a mesh is instanced twice")
+        taken.update(group.meshes)
+        demand(group.matrices.shape == (count, 4, 4) and count > 0, "matrices must have shape [k, 4, 4], k > 0")
+        demand(np.isfinite(group.matrices).all(), "matrices must be finite")
+        demand((group.matrices[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(), "matrices must be affine")
+        if group.colors is not None:
+            demand(group.colors.shape == (count, 3), "colors must have shape [k, 3], one per instance")
+            demand(group.colors.min() >= 0.0 and group.colors.max() <= 1.0, "colors must lie in [0, 1]")
+
+
 def _check_mesh(mesh: Mesh) -> None:
     count = len(mesh.triangles)
 
@@ -377,38 +432,65 @@ def _check_mesh(mesh: Mesh) -> None:
     for name, corners in mesh.uvs.items():
         demand(corners.shape == (count, 3, 2), f"uvs {name!r} must have shape [m, 3, 2]")
         demand(np.isfinite(corners).all(), f"uvs {name!r} must be finite")
+    if mesh.bare is not None:
+        demand(mesh.bare.shape == (count,) and mesh.bare.dtype == bool, "bare must have shape [m] and be of bools")
     if mesh.colors is not None and count:
         demand(mesh.colors.min() >= 0.0 and mesh.colors.max() <= 1.0, "colors must lie in [0, 1]")
 
 
-def _upload_surfaces(scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
-    """Fills the geometry and material tables; returns the owners of what they refer to by address."""
+def _glowing(scene: Scene) -> set[int]:
+    """The instanced meshes that emit. They are written out: every place of theirs is an emitter of its own."""
+    emits = np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
+    if not emits.any():
+        return set()
+    return {k for group in scene.instances for k in group.meshes if emits[scene.meshes[k].material].any()}
+
+
+def _arranged(scene: Scene) -> tuple[Scene, list[int]]:
+    """The scene as it is stored, meshes of the world before those of prototypes; and the meshes' former numbers."""
+    if not scene.instances:
+        return scene, list(range(len(scene.meshes)))
+    scene = scene.flat(_glowing(scene))
+    groups = [g for g in scene.instances if any(len(scene.meshes[k].triangles) for k in g.meshes)]
+    below = [k for g in groups for k in g.meshes]
+    unseen = {k for g in scene.instances for k in g.meshes} - {*below}
+    numbers = [k for k in range(len(scene.meshes)) if k not in unseen and k not in set(below)] + below
+    place = {k: i for i, k in enumerate(numbers)}
+    instances = tuple(replace(g, meshes=tuple(place[k] for k in g.meshes)) for g in groups)
+    return replace(scene, meshes=tuple(scene.meshes[k] for k in numbers), instances=instances), numbers
+
+
+def _upload_surfaces(scene: Scene, numbers: Sequence[int], frame: DeviceFrame, data: Any, launcher: Launcher) -> Any:
+    """Fills the geometry and material tables; returns the owners of what they refer to by id."""
     meshes = [m for m in scene.meshes if len(m.triangles)]
     data.triangle_count = sum(len(m.triangles) for m in meshes)
-    if meshes:
-        first = np.cumsum([0, *(len(m.points) for m in meshes[:-1])])
-        points = np.concatenate([frame.to_device(m.points) for m in meshes])
-        # A stray point that no triangle uses may be anything: keep it from the bounds and the compiler.
-        points[~np.isfinite(points).all(axis=1)] = 0.0
-        indices = np.concatenate([(m.triangles + f).reshape(-1) for m, f in zip(meshes, first, strict=True)])
-        material = np.concatenate([m.material for m in meshes])
-    else:
-        # An empty mesh crashes Warp; three coincident points are never hit.
-        points, indices, material = np.zeros((3, 3)), np.arange(3), np.zeros(1)
-    data.points = launcher.array(points, wp.vec3)
-    data.indices = launcher.array(indices.astype(np.int32), wp.int32)
+    storage = _Storage(scene, frame)
+    material = np.concatenate([m.material for m in meshes]) if meshes else np.zeros(1)
+    data.points = launcher.array(storage.points, wp.vec3)
+    data.indices = launcher.array(storage.indices, wp.int32)
     data.triangle_material = launcher.array(material.astype(np.int32), wp.int32)
-    source = [k for k, m in enumerate(scene.meshes) if len(m.triangles)]
+    source = [numbers[k] for k, m in enumerate(scene.meshes) if len(m.triangles)]
     counts = [len(m.triangles) for m in meshes]
     data.triangle_mesh = launcher.array(np.repeat(source, counts).astype(np.int32) if meshes else [-1], wp.int32)
     data.emits_back = launcher.array(
         np.repeat([m.double_sided for m in meshes], counts).astype(np.int32) if meshes else [0], wp.int32
     )
+    bare = _colored_by_instance(scene, counts)
     data.triangle_normals, data.corner_normals = _upload_corners([m.normals for m in meshes], counts, launcher)
-    data.triangle_colors, data.corner_colors = _upload_corners([m.colors for m in meshes], counts, launcher)
+    data.triangle_colors, data.corner_colors = _upload_corners(
+        [m.colors for m in meshes], counts, launcher, from_instance=bare
+    )
     patterns = _upload_materials(scene.materials or (Material(),), meshes, counts, data, launcher)
-    data.bvh, owner = build_bvh(data.points, data.indices, launcher)
-    return owner, patterns
+    parts = [(data.points, data.indices)]
+    if scene.instances:
+        parts = [
+            (launcher.array(storage.points[p], wp.vec3), launcher.array(storage.indices[t] - p.start, wp.int32))
+            for p, t in storage.parts
+        ]
+        if not storage.parts[0][0].stop:
+            parts[0] = (launcher.zeros(3, wp.vec3), launcher.array([0, 1, 2], wp.int32))
+    data.bvh, roots, owner = build_bvhs(parts, launcher)
+    return owner, patterns, _upload_instances(scene, frame, storage, roots, data, launcher)
 
 
 def _upload_materials(
@@ -444,8 +526,144 @@ def _upload_materials(
     return patterns
 
 
+class _Storage:
+    """Where points and triangles lie in the tables; prototypes of the same geometry share their points and tree."""
+
+    def __init__(self, scene: Scene, frame: DeviceFrame) -> None:
+        """Lays out an arranged scene.
+
+        `points` [n, 3] and `indices` [3 m] are the tables, `parts` the ranges of both that are a hierarchy each, the
+        world's first. For each of the scene's instances, `part` is the number of its prototype, from 0, `first` its
+        first triangle, and `frames` its prototype's frame.
+        """
+        instanced = {k for group in scene.instances for k in group.meshes}
+        self._points: list[Any] = []
+        self._indices: list[Any] = []
+        self._point_count = self._index_count = 0
+        for k, mesh in enumerate(scene.meshes):
+            if k not in instanced and len(mesh.triangles):
+                self._add(mesh, frame, self._point_count)
+        self.parts = [(slice(0, self._point_count), slice(0, self._index_count))]
+        self.part: list[int] = []
+        self.first: list[int] = []
+        self.frames: list[DeviceFrame] = []
+        self.halves: list[npt.NDArray[np.float64]] = []
+        known: dict[tuple[int, ...], int] = {}
+        for group in scene.instances:
+            meshes = [scene.meshes[k] for k in group.meshes if len(scene.meshes[k].triangles)]
+            self.first.append(self._index_count // 3)
+            geometry = tuple(id(x) for mesh in meshes for x in (mesh.points, mesh.triangles))
+            if geometry in known:
+                twin = known[geometry]
+                self.part.append(self.part[twin])
+                self.frames.append(self.frames[twin])
+                self.halves.append(self.halves[twin])
+                begin, count = self.parts[self.part[twin] + 1][1].start, 3 * sum(len(m.triangles) for m in meshes)
+                self._indices.append(np.concatenate(self._indices)[begin : begin + count])
+                self._index_count += count
+                continue
+            known[geometry] = len(self.part)
+            corners = [mesh.points[np.unique(mesh.triangles)] for mesh in meshes]
+            lower = np.min([c.min(axis=0) for c in corners], axis=0)
+            upper = np.max([c.max(axis=0) for c in corners], axis=0)
+            own = _frame(lower, upper)
+            point, index = self._point_count, self._index_count
+            for mesh in meshes:
+                self._add(mesh, own, self._point_count)
+            self.part.append(len(self.parts) - 1)
+            self.parts.append((slice(point, self._point_count), slice(index, self._index_count)))
+            self.frames.append(own)
+            self.halves.append(0.5 * (upper - lower) * own.scale)
+        # An empty mesh crashes Warp; three coincident points are never hit.
+        self.points = np.concatenate(self._points or [np.zeros((3, 3), np.float32)])
+        self.indices = np.concatenate(self._indices or [np.arange(3)]).astype(np.int32)
+
+    def _add(self, mesh: Mesh, frame: DeviceFrame, first: int) -> None:
+        points = frame.to_device(mesh.points)
+        # A stray point that no triangle uses may be anything: keep it from the bounds and the compiler.
+        points[~np.isfinite(points).all(axis=1)] = 0.0
+        self._points.append(points)
+        self._indices.append((mesh.triangles + first).reshape(-1))
+        self._point_count += len(points)
+        self._index_count += mesh.triangles.size
+
+
+def _upload_instances(
+    scene: Scene, frame: DeviceFrame, storage: _Storage, roots: Sequence[int], data: Any, launcher: Launcher
+) -> Any:
+    """Fills the instance tables; returns the owner of the tree over them."""
+    data.instance_colors = launcher.zeros(1, wp.vec3)
+    if not scene.instances:
+        data.two_level, data.instances = launcher.zeros(1, TwoLevel), launcher.zeros(1, Instance)
+        data.instance_axes = launcher.zeros(1, wp.mat33)
+        return None
+    lowers, uppers, tables, all_axes = [], [], [], []
+    for k, group in enumerate(scene.instances):
+        own = storage.frames[k]
+        linear = group.matrices[:, :3, :3]
+        axes = linear * (frame.scale / own.scale)
+        centre = frame.to_device(linear @ own.origin + group.matrices[:, :3, 3])
+        inverse = _inverses(axes, group)
+        # A ray comes in by the inverse and its hit goes out by the axes: the errors of both, in the device frame.
+        reach = np.abs(axes) @ storage.halves[k]
+        size = (np.abs(axes) @ (np.abs(inverse) @ reach[:, :, None]))[:, :, 0].max(axis=1)
+        size += np.abs(centre).max(axis=1)
+        lower, upper = boxes(-storage.halves[k], storage.halves[k], _matrices(axes, centre))
+        margin = size[:, None] * (16.0 * 2.0**-23)
+        table = np.zeros(len(axes), Instance.numpy_dtype())
+        table["inverse"], table["centre"], table["size"] = inverse, centre, size
+        table["root"], table["shift"] = roots[storage.part[k]], storage.first[k]
+        lowers.append((lower - margin).astype(np.float32))
+        uppers.append((upper + margin).astype(np.float32))
+        tables.append(table)
+        all_axes.append(axes.astype(np.float32))
+    if any(group.colors is not None for group in scene.instances):
+        colors = [np.zeros((len(g.matrices), 3)) if g.colors is None else g.colors for g in scene.instances]
+        data.instance_colors = launcher.array(np.concatenate(colors).astype(np.float32), wp.vec3)
+    data.instance_axes = launcher.array(np.concatenate(all_axes), wp.mat33)
+    lower, upper = np.concatenate(lowers), np.concatenate(uppers)
+    both = TwoLevel()
+    both.bvh = data.bvh
+    both.tree, owner = build_instance_tree(lower, upper, np.concatenate(tables), launcher)
+    data.instance_count, data.instances = len(lower), both.tree.instances
+    data.two_level = launcher.array([both], TwoLevel)
+    return owner, both
+
+
+def _inverses(axes: npt.NDArray[np.float64], group: Instances) -> npt.NDArray[np.float64]:
+    """Inverses [k, 3, 3] that a float32 can hold."""
+    with np.errstate(all="ignore"):
+        cofactor = cofactors(axes)
+        inverse = cofactor.transpose(0, 2, 1) / np.sum(axes[:, 0] * cofactor[:, 0], axis=1)[:, None, None]
+        good = np.isfinite(inverse.astype(np.float32)).all(axis=(1, 2)) & np.isfinite(axes).all(axis=(1, 2))
+    if not good.all():
+        raise InputError(f"{group.name}: the matrix of instance {int(np.argmin(good))} is singular")
+    return inverse
+
+
+def _matrices(axes: Any, centre: Any) -> npt.NDArray[np.float64]:
+    out = np.zeros((len(axes), 4, 4))
+    out[:, :3, :3], out[:, :3, 3] = axes, centre
+    return out
+
+
+def _colored_by_instance(scene: Scene, counts: Sequence[int]) -> npt.NDArray[np.bool_] | None:
+    """Which triangles [m] have the colour of their instance; None: none has."""
+    colored = {k for group in scene.instances if group.colors is not None for k in group.meshes}
+    meshes = [(m, k in colored and m.bare is not None) for k, m in enumerate(scene.meshes) if len(m.triangles)]
+    if not any(takes for _, takes in meshes):
+        return None
+    rows = [m.bare if takes else np.zeros(c, bool) for (m, takes), c in zip(meshes, counts, strict=True)]
+    return np.concatenate(rows)
+
+
 def _upload_corners(
-    corners: list[Any], counts: list[int], launcher: Launcher, dtype: Any = wp.vec3, per_triangle: int = 3
+    corners: list[Any],
+    counts: list[int],
+    launcher: Launcher,
+    dtype: Any = wp.vec3,
+    per_triangle: int = 3,
+    from_instance: Any = None,
 ) -> tuple[Any, Any]:
     """Per-triangle offsets (-1: none) into one table of the corner values of the meshes that have them."""
     columns = wp.types.type_size(dtype)
@@ -457,6 +675,8 @@ def _upload_corners(
             values.append(corner.reshape(-1, columns))
             row += per_triangle * count
         triangle += count
+    if from_instance is not None:
+        rows[from_instance] = INSTANCE_COLOR
     table = np.concatenate(values) if values else np.zeros((1, columns))
     return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), dtype)
 

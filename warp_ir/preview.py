@@ -5,6 +5,7 @@ Drawn off-screen by PyVista: no display is needed.
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ _DECADES = 4.0
 _POINT_SIZES = (14.0, 10.0, 7.0, 5.0, 4.0)
 """Pixels of VPLs of bounce 0, 1, ...; the last stands for all others. For a picture 1000 pixels high; never below 3."""
 _BACKGROUND = "#16181d"
+_MOST_TRIANGLES = 5_000_000
+"""Of instances, so many are drawn as make about this number."""
 
 
 def picture_vpls(
@@ -82,6 +85,17 @@ def _outside(scene: Scene, aspect: float) -> Camera:
     return Camera.look_at(eye.tolist(), center.tolist(), up.tolist(), fov=fov, aspect=aspect)
 
 
+def _written_out(scene: Scene) -> Scene:
+    """The scene without instances: their copies, or of too many an even selection."""
+    step = max(1, math.ceil(scene.triangles_seen / _MOST_TRIANGLES))
+    thinned = (replace(g, matrices=g.matrices[::step], colors=_every(g.colors, step)) for g in scene.instances)
+    return replace(scene, instances=tuple(thinned)).flat()
+
+
+def _every(rows: Any, step: int) -> Any:
+    return None if rows is None else rows[::step]
+
+
 def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool) -> None:
     """The surfaces in their albedo, dimmed, and shaded by how they face the camera.
 
@@ -92,7 +106,7 @@ def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool)
 
     lower, upper = scene.bounds()
     eye, center = camera.world_from_camera[:3, 3], 0.5 * (lower + upper)
-    for mesh in scene.meshes:
+    for mesh in _written_out(scene).meshes:
         corners = mesh.points[mesh.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]

@@ -1,19 +1,21 @@
 """The scene as the host sees it: frozen records of NumPy arrays, no Warp, no USD.
 
-Everything is in world space and in scene units (whatever unit the stage uses: transport never
-needs to know). Matrices act on column vectors, ``world = matrix @ local``, and are float64 so that
-a scene far from the origin keeps its detail until it is uploaded.
+Everything is in world space (meshes that are instanced: in their prototype's) and in scene units (whatever unit
+the stage uses: transport never needs to know). Matrices act on column vectors, ``world = matrix @ local``, and are
+float64 so that a scene far from the origin keeps its detail until it is uploaded.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
+
+from warp_ir.placing import areas_of_copies, bounds_of_copies, place
 
 Color = tuple[float, float, float]
 Floats = npt.NDArray[np.floating]
@@ -120,7 +122,7 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in world space.
+    """Triangles in world space, or in the space of the prototype that they are part of (`Instances`).
 
     Surfaces reflect and block on both sides. The winding (counter-clockwise seen from the front)
     decides only which side emits, and where the geometric normal points.
@@ -129,7 +131,7 @@ class Mesh:
     name: str
     """Prim path, or any label for messages."""
     points: Floats
-    """float64 [n, 3], world space."""
+    """float64 [n, 3]."""
     triangles: Ints
     """int32 [m, 3], indices into `points`, counter-clockwise seen from the front."""
     material: Ints
@@ -142,6 +144,22 @@ class Mesh:
     """Whether an emissive material emits from the back as well."""
     uvs: Mapping[str, Floats] = field(default_factory=dict)
     """Texture coordinates of the triangles' corners by name, float32 [m, 3, 2]."""
+    bare: npt.NDArray[np.bool_] | None = None
+    """bool [m], triangles that take the colour of their instance where `Instances.colors` has one; None: none do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """Meshes that are stored once and seen in many places."""
+
+    name: str
+    """Path of the prototype, or any label for messages."""
+    meshes: tuple[int, ...]
+    """Indices into `Scene.meshes`; a mesh is part of one `Instances` at most, and then not seen by itself."""
+    matrices: Floats
+    """world_from_prototype, float64 [k, 4, 4], invertible; mirrored and sheared ones are fine."""
+    colors: Floats | None = None
+    """float32 [k, 3], albedo of the triangles that `Mesh.bare` selects; None: their material's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +307,8 @@ class Scene:
     camera: Camera = field(default_factory=Camera)
     name: str = ""
     """File or label the scene came from."""
+    instances: tuple[Instances, ...] = ()
+    """Which of the meshes are prototypes, and where those are; all other meshes are in the world as they stand."""
     warnings: tuple[str, ...] = ()
     """What was skipped, approximated or guessed: one line each, beginning with the prim's path."""
     stats: Mapping[str, int] = field(default_factory=dict)
@@ -302,13 +322,20 @@ class Scene:
 
     @property
     def triangle_count(self) -> int:
-        """Number of triangles over all meshes."""
+        """Number of triangles over all meshes: what is stored."""
         return sum(len(mesh.triangles) for mesh in self.meshes)
+
+    @property
+    def triangles_seen(self) -> int:
+        """Number of triangles in the world: those of a prototype count once for every instance."""
+        more = sum((len(i.matrices) - 1) * sum(len(self.meshes[k].triangles) for k in i.meshes) for i in self.instances)
+        return self.triangle_count + more
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper corner of the meshes' bounding box, float64 [3]; a unit cube if there are none."""
         # Only points that a triangle uses count: stray points must not move the scene's frame.
-        boxes = [_box(mesh) for mesh in self.meshes if len(mesh.triangles)]
+        placed = [x for x in self._placed() if len(x[0].triangles) and (x[1] is None or len(x[1].matrices))]
+        boxes = [_box(mesh, group) for mesh, group in placed]
         if not boxes:
             return np.full(3, -0.5), np.full(3, 0.5)
         return np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
@@ -321,23 +348,55 @@ class Scene:
 
     def area(self) -> float:
         """Area of all surfaces, one side each, in square scene units."""
-        return float(sum(_areas(mesh).sum() for mesh in self.meshes))
+        return float(sum(_area_in_world(mesh, group).sum() for mesh, group in self._placed()))
 
     def mean_albedo(self) -> float:
         """Mean reflectivity ρ̄ of the surfaces, weighted by area, averaged over the channels (Keller 1997)."""
         albedo = np.array([m.albedo for m in self.materials], dtype=np.float64).reshape(-1, 3).mean(axis=1)
         total, reflected = 0.0, 0.0
-        for mesh in self.meshes:
+        for mesh, group in self._placed():
             area = _areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
-            total += float(area.sum())
-            reflected += float((area * rho).sum())
+            if group is None:
+                total += float(area.sum())
+                reflected += float((area * rho).sum())
+                continue
+            copies = _area_in_world(mesh, group)
+            share = area / area.sum() if area.sum() > 0.0 else area
+            means: Floats = np.full(len(copies), share @ rho)
+            if group.colors is not None and mesh.bare is not None:
+                bare = mesh.bare
+                means = share[~bare] @ rho[~bare] + share[bare].sum() * group.colors.mean(axis=1)
+            total += float(copies.sum())
+            reflected += float((copies * means).sum())
         return reflected / total if total > 0.0 else 0.0
+
+    def flat(self, meshes: Collection[int] | None = None) -> "Scene":
+        """This scene with instanced meshes written out, copy by copy; their indices stay.
+
+        Args:
+            meshes: Which; None: all of them.
+        """
+        written, left = list(self.meshes), []
+        for group in self.instances:
+            chosen = [k for k in group.meshes if meshes is None or k in meshes]
+            for k in chosen:
+                written[k] = _written_out(self.meshes[k], group, self.materials)
+            rest = tuple(k for k in group.meshes if k not in chosen)
+            if rest:
+                left.append(replace(group, meshes=rest))
+        return replace(self, meshes=tuple(written), instances=tuple(left))
+
+    def _placed(self) -> list[tuple[Mesh, Instances | None]]:
+        """Every mesh with the instances it is part of."""
+        groups = {k: group for group in self.instances for k in group.meshes}
+        return [(mesh, groups.get(k)) for k, mesh in enumerate(self.meshes)]
 
 
 # A mesh that does not move is part of many scenes: what is computed of it is kept as long as it lives.
 _AREAS: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
-_BOXES: WeakKeyDictionary[Mesh, tuple[Floats, Floats]] = WeakKeyDictionary()
+_AREAS_OF_COPIES: WeakKeyDictionary[Instances, WeakKeyDictionary[Mesh, Floats]] = WeakKeyDictionary()
+_BOXES: WeakKeyDictionary[Mesh | Instances, WeakKeyDictionary[Mesh, tuple[Floats, Floats]]] = WeakKeyDictionary()
 
 
 def _areas(mesh: Mesh) -> Floats:
@@ -348,9 +407,56 @@ def _areas(mesh: Mesh) -> Floats:
     return _AREAS[mesh]
 
 
-def _box(mesh: Mesh) -> tuple[Floats, Floats]:
-    """Lower and upper corner [3] of the points that the triangles use."""
-    if mesh not in _BOXES:
+def _area_in_world(mesh: Mesh, group: Instances | None) -> Floats:
+    """Areas of a mesh's triangles, or of its copies, float64."""
+    if group is None:
+        return _areas(mesh)
+    known = _AREAS_OF_COPIES.setdefault(group, WeakKeyDictionary())
+    if mesh not in known:
+        known[mesh] = areas_of_copies(mesh.points, mesh.triangles, group.matrices)
+    return known[mesh]
+
+
+def _box(mesh: Mesh, group: Instances | None) -> tuple[Floats, Floats]:
+    """Lower and upper corner [3] of the points that the triangles use, or of their copies."""
+    known = _BOXES.setdefault(group or mesh, WeakKeyDictionary())
+    if mesh not in known:
         used = mesh.points[np.unique(mesh.triangles)]
-        _BOXES[mesh] = (used.min(axis=0), used.max(axis=0))
-    return _BOXES[mesh]
+        if group is None:
+            known[mesh] = (used.min(axis=0), used.max(axis=0))
+        else:
+            known[mesh] = bounds_of_copies(used, group.matrices)
+    return known[mesh]
+
+
+def _written_out(mesh: Mesh, group: Instances, materials: Sequence[Material]) -> Mesh:
+    """An instanced mesh as one in the world: all its copies, one after the other."""
+    copies = len(group.matrices)
+    points, triangles, normals = place(mesh.points, mesh.triangles, mesh.normals, group.matrices)
+    mirrored = np.linalg.det(group.matrices[:, :3, :3]) < 0.0
+    # What else a mesh has, it has per triangle, or per corner of each.
+    tables: dict[str, Any] = {
+        f.name: _repeated(getattr(mesh, f.name), mirrored)
+        for f in fields(mesh)
+        if f.name not in ("points", "triangles", "normals", "bare")
+    }
+    if group.colors is not None and mesh.bare is not None:
+        own = mesh.colors
+        if own is None:
+            albedo = np.array([m.albedo for m in materials], np.float32)[mesh.material]
+            own = np.repeat(albedo[:, None], 3, axis=1)
+        given = group.colors.astype(np.float32)[:, None, None]
+        own = _repeated(own, mirrored).reshape(copies, -1, 3, 3)
+        tables["colors"] = np.where(mesh.bare[None, :, None, None], given, own).reshape(-1, 3, 3)
+    return replace(mesh, points=points, triangles=triangles, normals=normals, bare=None, **tables)
+
+
+def _repeated(value: Any, mirrored: Any) -> Any:
+    """A table, or each of a mapping of tables, once for every copy; anything else as it is.
+
+    Rows [m, 3, c] are of corners, which `place` turns round in mirrored copies.
+    """
+    if isinstance(value, np.ndarray):
+        turned = value[:, ::-1] if value.ndim == 3 else value
+        return np.concatenate([turned if is_mirrored else value for is_mirrored in mirrored])
+    return {key: _repeated(v, mirrored) for key, v in value.items()} if isinstance(value, Mapping) else value

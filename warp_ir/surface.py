@@ -3,13 +3,14 @@
 Intersection points come from barycentric coordinates, which keeps their error within a few ulp of the
 triangle's own coordinates however far the ray has come (Wächter and Binder 2019). A ray therefore starts
 8 ulp off the surface, on the side it leaves from, and as far from the triangle's edges, behind which the next wall
-may stand: farther than the error, nearer than any detail a float can hold, at any scale.
+may stand: farther than the error, nearer than any detail a float can hold, at any scale. For an instance, the way
+of a ray into the prototype's space and that of the hit back add to the error.
 """
 
 import warp as wp
 
-from warp_ir.bvh import intersect
-from warp_ir.device_scene import Patterns, SceneData
+from warp_ir.bvh import intersect, intersect_instances
+from warp_ir.device_scene import INSTANCE_COLOR, Patterns, SceneData
 from warp_ir.sampling import hash_combine
 from warp_ir.texture import coordinates, lookup, mip_level
 
@@ -19,6 +20,7 @@ _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 _MOST_PULL = wp.constant(1.0e-3)  # a needle thinner than its rounding error has no inside
 _INFINITY = wp.constant(3.0e38)
 _MOST_LAYERS = wp.constant(1024)  # open surfaces that a ray passes before it is given up
+_INSTANCE = wp.constant(INSTANCE_COLOR)
 
 
 @wp.struct
@@ -26,6 +28,7 @@ class Hit:
     """Where a ray meets a surface; `triangle` is -1 if it does not."""
 
     triangle: int
+    instance: int  # of which it is part; -1: it is in the world as it stands
     t: float  # in units of the ray's direction
     u: float  # weights of the triangle's first and second corner
     v: float
@@ -42,13 +45,38 @@ def offset(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp
     It is moved by more than its rounding error away from the triangle's edges, and along `direction`, a sum of unit
     vectors on the side the rays leave from.
     """
-    size = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
-    error = size * _EIGHT_ULP
+    return _start(a, b, c, u, v, direction, _largest(a, b, c) * _EIGHT_ULP)
+
+
+@wp.func
+def _largest(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
+    return wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
+
+
+@wp.func
+def _start(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp.vec3, error: float) -> wp.vec3:
+    """A point of a triangle, moved away from its edges and along `direction` by a given error."""
     longest = wp.sqrt(wp.max(wp.max(wp.length_sq(b - a), wp.length_sq(c - b)), wp.length_sq(a - c)))
     # Towards the centroid by `error` at an edge, as the lowest of the triangle's heights measures it.
     pull = wp.min(error * longest / wp.length(wp.cross(b - a, c - a)), _MOST_PULL)
     inner = a * (u + pull * (1.0 - 3.0 * u)) + b * (v + pull * (1.0 - 3.0 * v))
     return inner + c * (1.0 - u - v + pull * (3.0 * (u + v) - 2.0)) + direction * error
+
+
+@wp.func
+def leave(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
+    """Where rays may start near a hit; `direction` as for `offset`."""
+    a = scene.points[scene.indices[3 * hit.triangle]]
+    b = scene.points[scene.indices[3 * hit.triangle + 1]]
+    c = scene.points[scene.indices[3 * hit.triangle + 2]]
+    if hit.instance < 0:
+        return offset(a, b, c, hit.u, hit.v, direction)
+    axes = scene.instance_axes[hit.instance]
+    a = axes * a
+    b = axes * b
+    c = axes * c
+    error = (_largest(a, b, c) + scene.instances[hit.instance].size) * _EIGHT_ULP
+    return _start(a, b, c, hit.u, hit.v, direction, error) + scene.instances[hit.instance].centre
 
 
 @wp.func
@@ -109,9 +137,15 @@ def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float
     """The nearest triangle along a ray, open or not."""
     hit = Hit()
     hit.triangle = -1
+    hit.instance = -1
     found = intersect(scene.bvh, origin, direction, t_max, False)
+    if scene.instance_count > 0:
+        inside = intersect_instances(scene.two_level, origin, direction, found.t, False)
+        if inside.triangle >= 0:
+            found = inside
     if found.triangle >= 0:
         hit.triangle = found.triangle
+        hit.instance = found.instance
         hit.t = found.t
         hit.u = found.u
         hit.v = found.v
@@ -119,12 +153,19 @@ def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float
         a = scene.points[scene.indices[3 * hit.triangle]]
         b = scene.points[scene.indices[3 * hit.triangle + 1]]
         c = scene.points[scene.indices[3 * hit.triangle + 2]]
-        cross = wp.cross(b - a, c - a)
-        hit.area = 0.5 * wp.length(cross)
-        n = wp.normalize(cross)
+        ab = b - a
+        ac = c - a
+        n = wp.cross(ab, ac)
+        if hit.instance >= 0:
+            axes = scene.instance_axes[hit.instance]
+            hit.area = 0.5 * wp.length(wp.cross(axes * ab, axes * ac))
+            n = wp.transpose(scene.instances[hit.instance].inverse) * n
+        else:
+            hit.area = 0.5 * wp.length(n)
+        n = wp.normalize(n)
         hit.normal = wp.where(hit.front == 1, n, -n)
         # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
-        hit.position = offset(a, b, c, hit.u, hit.v, hit.normal - wp.normalize(direction))
+        hit.position = leave(scene, hit, hit.normal - wp.normalize(direction))
     return hit
 
 
@@ -141,26 +182,34 @@ def _scene_at(address: wp.uint64) -> wp.array[SceneData]:
     ...
 
 
+@wp.func
+def _way(origin: wp.vec3, target: wp.vec4) -> wp.vec3:
+    return wp.vec3(target[0], target[1], target[2]) - origin * target[3]
+
+
 @wp.func(inline=False)  # and by address: handing on the whole record takes it out of the registers of the caller
-def _nearest_present(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
-    """The nearest triangle that is there where the ray meets it."""
+def _nearest_present(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max: float) -> Hit:
+    """The nearest triangle on the way to a homogeneous point that is there where the ray meets it."""
     scene = _scene_at(address)[0]
+    along = _way(origin, target)
     start = origin
     passed = float(0.0)
     for _layer in range(_MOST_LAYERS):
-        hit = _nearest(scene, start, direction, t_max - passed)
+        # Every step off a surface moves the ray a little: it is aimed anew, or not only the last surface would end it.
+        way = _way(start, target)
+        hit = _nearest(scene, start, way, wp.where(target[3] == 0.0, t_max - passed, t_max))
         if hit.triangle < 0:
             return hit
-        passed += hit.t
         if not _is_open(scene, hit.triangle, hit.u, hit.v):
-            hit.t = passed
+            hit.t += passed
             return hit
-        a = scene.points[scene.indices[3 * hit.triangle]]
-        b = scene.points[scene.indices[3 * hit.triangle + 1]]
-        c = scene.points[scene.indices[3 * hit.triangle + 2]]
-        start = offset(a, b, c, hit.u, hit.v, wp.normalize(direction) - hit.normal)
+        start = leave(scene, hit, wp.normalize(way) - hit.normal)
+        passed = wp.dot(start - origin, along) / wp.length_sq(along)
+        if passed >= t_max:
+            break
     nothing = Hit()
     nothing.triangle = -1
+    nothing.instance = -1
     return nothing
 
 
@@ -168,18 +217,23 @@ def _nearest_present(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_
 def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest surface along a ray."""
     if scene.open_count > 0:
-        return _nearest_present(scene.address, origin, direction, t_max)
+        target = wp.vec4(direction[0], direction[1], direction[2], 0.0)
+        return _nearest_present(scene.address, origin, target, t_max)
     return _nearest(scene, origin, direction, t_max)
 
 
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
-    way = wp.vec3(target[0], target[1], target[2]) - origin * target[3]
     reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
     if scene.open_count > 0:
-        return _nearest_present(scene.address, origin, way, reach).triangle < 0
-    return intersect(scene.bvh, origin, way, reach, True).triangle < 0
+        return _nearest_present(scene.address, origin, target, reach).triangle < 0
+    way = _way(origin, target)
+    if intersect(scene.bvh, origin, way, reach, True).triangle >= 0:
+        return False
+    if scene.instance_count > 0:
+        return intersect_instances(scene.two_level, origin, way, reach, True).triangle < 0
+    return True
 
 
 @wp.func
@@ -188,11 +242,15 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
     row = scene.triangle_normals[hit.triangle]
     if row < 0:
         return hit.normal
-    n = (
-        hit.u * scene.corner_normals[row]
-        + hit.v * scene.corner_normals[row + 1]
-        + (1.0 - hit.u - hit.v) * scene.corner_normals[row + 2]
-    )
+    a = scene.corner_normals[row]
+    b = scene.corner_normals[row + 1]
+    c = scene.corner_normals[row + 2]
+    if hit.instance >= 0:
+        to_device = wp.transpose(scene.instances[hit.instance].inverse)
+        a = wp.normalize(to_device * a)
+        b = wp.normalize(to_device * b)
+        c = wp.normalize(to_device * c)
+    n = hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c
     length = wp.length(n)
     if length < 1.0e-6:
         return hit.normal
@@ -214,12 +272,20 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
     for k in range(3):
         weight = wp.where(k == 0, hit.u, wp.where(k == 1, hit.v, 1.0 - hit.u - hit.v))
         n = scene.corner_normals[row + k]
+        corner = scene.points[scene.indices[3 * hit.triangle + k]]
+        if hit.instance >= 0:
+            n = wp.normalize(wp.transpose(scene.instances[hit.instance].inverse) * n)
+            corner = scene.instance_axes[hit.instance] * corner + scene.instances[hit.instance].centre
         n = wp.where(wp.dot(n, hit.normal) < 0.0, -n, n)
-        below = wp.dot(scene.points[scene.indices[3 * hit.triangle + k]] - hit.position, n)
+        below = wp.dot(corner - hit.position, n)
         rise += weight * wp.max(below, 0.0) * n
     # What stands on the surface, or close above it, must stay above the point.
-    if wp.length_sq(rise) > 0.0 and intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
-        return wp.vec3(0.0)
+    if wp.length_sq(rise) > 0.0:
+        if intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
+            return wp.vec3(0.0)
+        if scene.instance_count > 0:
+            if intersect_instances(scene.two_level, hit.position, rise, 2.0, True).triangle >= 0:
+                return wp.vec3(0.0)
     return rise
 
 
@@ -233,6 +299,8 @@ def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
                 scene.patterns, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
             )
     row = scene.triangle_colors[hit.triangle]
+    if row == _INSTANCE:
+        return scene.instance_colors[hit.instance]
     if row < 0:
         return scene.albedo[material]
     return (

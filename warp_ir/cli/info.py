@@ -60,6 +60,16 @@ def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
         "cost": {"load_seconds": seconds, "scene_bytes": _BYTES_PER_TRIANGLE * scene.triangle_count},
         "meshes": len(scene.meshes),
         "triangles": scene.triangle_count,
+        "triangles_seen": scene.triangles_seen,
+        "prototypes": [
+            {
+                "name": group.name,
+                "meshes": len(group.meshes),
+                "triangles": sum(len(scene.meshes[k].triangles) for k in group.meshes),
+                "instances": len(group.matrices),
+            }
+            for group in scene.instances
+        ],
         "bounds": [_floats(lower), _floats(upper)],
         "lights": [
             {"name": light.name, "kind": light.kind.name.lower(), "radiance": _floats(light.radiance)}
@@ -104,7 +114,13 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     _list("settings", _settings_lines(facts), most)
     moving = f", {facts['moving_meshes']} of them move or change" if facts["moving_meshes"] else ""
     _row("meshes", f"{facts['meshes']}{moving}")
-    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit")
+    seen = f"; {facts['triangles_seen']} are seen" if facts["prototypes"] else ""
+    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit{seen}")
+    _list(
+        "prototypes",
+        [f"{p['instances']} instances of {p['triangles']} triangles  {p['name']}" for p in facts["prototypes"]],
+        most,
+    )
     _row("bounds", f"({_numbers(lower)}) to ({_numbers(upper)})")
     _list("lights", _light_lines(facts), most)
     _list("materials", _material_lines(facts), most)

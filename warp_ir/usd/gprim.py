@@ -1,27 +1,56 @@
-"""Gprims to meshes: each shape read once, given its look, and placed wherever it is drawn."""
+"""Gprims to meshes: each shape read once, given its look, and placed wherever it is drawn, or kept as a prototype."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pxr import Sdf, Usd, UsdLux
 
-from warp_ir.scene import Floats, InputError, Ints, Material, Mesh
+from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
 from warp_ir.usd import value
 from warp_ir.usd.glow import glow
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
+from warp_ir.usd.instancing import combined, combined_colors
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.network import Images
 from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.shape import Shape, cross_products, place, without_slivers
+from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
+from warp_ir.usd.sharing import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share
 from warp_ir.usd.skel import Skinning, sharing_key
 from warp_ir.usd.walk import Site
 
-_MOST_TRIANGLES = 200_000_000
-"""A flattened scene of this size takes tens of gigabytes: refused before it is allocated."""
-
 _Shapes = dict[tuple[Sdf.Path, ...], Shape | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What a stage draws."""
+
+    meshes: tuple[Mesh, ...]
+    instances: tuple[Instances, ...]
+    materials: tuple[Material, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Gprim:
+    """A gprim as it was read."""
+
+    site: Site
+    shape: Shape
+    look: Look
+    emits: bool
+
+
+@dataclass(eq=False)
+class _Prototype:
+    """A prototype that is stored once, while its meshes are made."""
+
+    matrices: Floats
+    colors: Floats | None
+    fit: Mask
+    """Which of its places can be instances; the others are written out."""
+    meshes: list[int] = field(default_factory=list)
 
 
 def build_meshes(
@@ -32,8 +61,8 @@ def build_meshes(
     shapes: _Shapes | None = None,
     images: Images | None = None,
     metals: str = "diffuse",
-) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
-    """All meshes in the world, one per gprim with all its copies, and the materials they use.
+) -> Geometry:
+    """All meshes, one per gprim with all its copies, those that are instanced, and the materials they use.
 
     Args:
         sites: The gprims and where they are drawn.
@@ -58,21 +87,101 @@ class _Builder:
         self._time, self._report, self._levels, self._table = time, report, levels, table
         self._skinning = Skinning(time, report)
         self._shapes = shapes
+        self._seen: dict[tuple[object, ...], tuple[Shape, Look, bool]] = {}
+        self._known: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
 
-    def run(self, sites: Sequence[Site]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
+    def run(self, sites: Sequence[Site]) -> Geometry:
         self._table.resolve([site.prim for site in sites])
-        total = 0
-        meshes = []
-        shapes = [self._shape(site.prim) for site in sites]
-        for site, shape in zip(sites, shapes, strict=True):
-            total += 0 if shape is None else len(shape.triangles) * len(site.matrices)
-        if total > _MOST_TRIANGLES:
-            raise InputError(f"{self._report.source}: {total} triangles after instancing: too many to load")
-        for site, shape in zip(sites, shapes, strict=True):
-            mesh = None if shape is None else self._mesh(site, shape)
-            if mesh is not None:
-                meshes.append(mesh)
-        return self._only_used(meshes)
+        gprims = [gprim for site in sites if (gprim := self._gprim(site)) is not None]
+        parts = [Part(g.site.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
+        meshes: list[Mesh] = []
+        prototypes: dict[int, _Prototype] = {}
+        for drawn in share(parts, self._report.source):
+            gprim, home = gprims[drawn.part], drawn.group
+            places = combined(level.matrices for level in drawn.levels)
+            colors = combined_colors((len(level.matrices), level.colors) for level in drawn.levels)
+            if home is None:
+                self._add(meshes, self._mesh(gprim, places, colors))
+                continue
+            if id(home) not in prototypes:
+                prototypes[id(home)] = self._prototype(home, gprim)
+            prototype = prototypes[id(home)]
+            if prototype.fit.any():
+                mesh = self._mesh(gprim, places, colors, shared=True)
+                if mesh is not None and (prototype.colors is None or colors is not None):
+                    mesh = replace(mesh, bare=None)
+                prototype.meshes += self._add(meshes, mesh)
+            if not prototype.fit.all():
+                self._add(meshes, self._unfit(gprim, prototype, places, colors))
+        instances = [
+            Instances(
+                meshes[prototype.meshes[0]].name,
+                tuple(prototype.meshes),
+                prototype.matrices[prototype.fit],
+                None if prototype.colors is None else prototype.colors[prototype.fit].astype(np.float32),
+            )
+            for prototype in prototypes.values()
+            if prototype.meshes
+        ]
+        renamed, materials = self._only_used(meshes)
+        return Geometry(renamed, tuple(instances), materials)
+
+    @staticmethod
+    def _add(meshes: list[Mesh], mesh: Mesh | None) -> list[int]:
+        """Appends a mesh if there is one; its index."""
+        if mesh is None:
+            return []
+        meshes.append(mesh)
+        return [len(meshes) - 1]
+
+    def _gprim(self, site: Site) -> _Gprim | None:
+        """A gprim without the triangles that are not there; equal looks are stored once."""
+        whole = self._shape(site.prim)
+        if whole is None:
+            return None
+        look = self._table.look(site.prim, whole)
+        uvs = tuple((name, digest(corners)) for name, corners in sorted(look.uvs.items()))
+        key = (id(whole), digest(look.material), digest(look.colors), digest(look.bare), uvs)
+        if key not in self._seen:
+            present, shape = look.material != ABSENT, whole
+            if not present.all():
+                shape, look = whole.keep(present), look.keep(present)
+            emission = [max(self._table.materials[k].emission) for k in np.unique(look.material)]
+            self._seen[key] = (shape, look, max(emission, default=0.0) > 0.0)
+        shape, look, emits = self._seen[key]
+        absent = len(whole.triangles) - len(shape.triangles)
+        self._report.stats["triangles_absent"] += absent * site.level.total
+        if len(shape.triangles) == 0:
+            return None
+        lamp = site.lamp is not None or site.prim.HasAPI(UsdLux.LightAPI)
+        return _Gprim(site, shape, look, emits or lamp)
+
+    @staticmethod
+    def _signature(gprim: _Gprim) -> object:
+        """Equal for gprims of the same prototype that look the same; shapes and looks are kept, so ids will do."""
+        return id(gprim.shape), id(gprim.look), digest(gprim.site.local)
+
+    def _prototype(self, group: Group, gprim: _Gprim) -> _Prototype:
+        matrices = group.matrices()
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        if not finite.all():
+            self._report.warn(
+                gprim.site.prim.GetPath(), "{n} instances with infinite transforms left out", int((~finite).sum())
+            )
+        colors = group.colors()
+        matrices, colors = matrices[finite], None if colors is None else colors[finite]
+        return _Prototype(matrices, colors, fit_for_rays(matrices))
+
+    def _unfit(self, gprim: _Gprim, prototype: _Prototype, places: Floats, colors: Floats | None) -> Mesh | None:
+        """The copies whose matrices collapse the prototype, or nearly, in the world."""
+        matrices = prototype.matrices[~prototype.fit]
+        if len(matrices) * len(places) * len(gprim.shape.triangles) > MOST_WRITTEN:
+            path = gprim.site.prim.GetPath()
+            self._report.warn(path, "{n} instances with singular transforms left out", len(matrices))
+            return None
+        outer = None if prototype.colors is None else prototype.colors[~prototype.fit]
+        given = combined_colors([(len(matrices), outer), (len(places), colors)])
+        return self._mesh(gprim, combined([matrices, places]), given)
 
     def _shape(self, prim: Usd.Prim) -> Shape | None:
         """The prim's triangles in its own space; instances of the same prototype share them."""
@@ -98,22 +207,33 @@ class _Builder:
             return read_tet_mesh(prim, self._time, self._report)
         return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
-    def _mesh(self, site: Site, shape: Shape) -> Mesh | None:
-        """A gprim in all its places as one mesh."""
-        prim, copies = site.prim, len(site.matrices)
-        look = self._table.look(prim, shape)
-        present = look.material != ABSENT
-        if not present.all():
-            self._report.stats["triangles_absent"] += int((~present).sum()) * copies
-            shape, look = shape.keep(present), look.keep(present)
-        points, triangles, normals = place(shape, site.matrices)
-        material, colors = np.tile(look.material, copies), self._colors(look, site)
+    def _mesh(self, gprim: _Gprim, places: Floats, given: Floats | None, *, shared: bool = False) -> Mesh | None:
+        """A gprim in all its places as one mesh.
+
+        Args:
+            gprim: What.
+            places: Of its level, [k, 4, 4].
+            given: The places' own colours [k, 3], or None.
+            shared: Whether it is a prototype's: then it says where its instances may colour it.
+        """
+        prim, shape, look = gprim.site.prim, gprim.shape, gprim.look
+        matrices = places @ gprim.site.local
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        if not finite.all():
+            self._report.warn(prim.GetPath(), "{n} copies with infinite transforms left out", int((~finite).sum()))
+            matrices, given = matrices[finite], None if given is None else given[finite]
+            if not finite.any():
+                return None
+        copies = len(matrices)
+        points, triangles, normals = self._placed(shape, matrices, shared=shared)
+        material, colors = np.tile(look.material, copies), self._colors(look, given, copies)
         uvs = {name: np.tile(corners, (copies, 1, 1)) for name, corners in look.uvs.items()}
-        mirrored = np.repeat(np.linalg.det(site.matrices[:, :3, :3]) < 0.0, len(shape.triangles))
+        mirrored = np.repeat(np.linalg.det(matrices[:, :3, :3]) < 0.0, len(shape.triangles))
         if mirrored.any():  # `place` has turned their corners round
             for corners in (*uvs.values(), *([] if colors is None else [colors])):
                 corners[mirrored] = corners[mirrored][:, ::-1]
-        if (np.linalg.det(site.matrices[:, :3, :3]) == 0.0).any():
+        bare = np.tile(look.bare, copies) if shared and look.bare is not None else None
+        if (np.linalg.det(matrices[:, :3, :3]) == 0.0).any():
             # A flattened copy keeps the triangles that still have an area.
             order = np.arange(len(triangles))
             kept = without_slivers(Shape(points, triangles, order, triangles, normals))
@@ -121,9 +241,10 @@ class _Builder:
             normals = None if kept.normals is None else _or_geometric(kept.normals, points, triangles)
             colors = None if colors is None else colors[kept.face]
             uvs = {name: corners[kept.face] for name, corners in uvs.items()}
+            bare = None if bare is None else bare[kept.face]
         if len(triangles) == 0:
             return None
-        lamp = prim if prim.HasAPI(UsdLux.LightAPI) else site.lamp
+        lamp = prim if prim.HasAPI(UsdLux.LightAPI) else gprim.site.lamp
         if lamp is not None:
             used, material = np.unique(material, return_inverse=True)
             area = 0.5 * float(np.linalg.norm(cross_products(points, triangles), axis=1).sum()) / copies
@@ -133,14 +254,22 @@ class _Builder:
                 colors = None  # a light that answers with no material reflects no colour either
         # Of the implicit shapes only the plane is double-sided unless it says otherwise; its schema knows.
         double_sided = value.flag(prim.GetAttribute("doubleSided"), self._time)
-        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs)
+        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare)
 
-    def _colors(self, look: Look, site: Site) -> Floats | None:
+    def _placed(self, shape: Shape, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
+        """Copies of a shape; the same arrays for prototypes of the same geometry, which then share their tree."""
+        if not shared:
+            return place(shape, matrices)
+        key = (id(shape.points), digest(shape.triangles), digest(matrices))
+        if key not in self._known:
+            self._known[key] = place(shape, matrices)
+        return self._known[key]
+
+    def _colors(self, look: Look, given: Floats | None, copies: int) -> Floats | None:
         """Albedo of the corners, float32 [k m, 3, 3], where a material's alone will not do."""
-        copies = len(site.matrices)
-        if site.colors is None or look.bare is None:
+        if given is None or look.bare is None:
             return None if look.colors is None else np.tile(look.colors, (copies, 1, 1))
-        given = site.colors.astype(np.float32)[:, None]
+        given = given.astype(np.float32)[:, None]
         per_triangle = np.where(look.bare[None, :, None], given, self._table.albedo(look.material)[None])
         return np.repeat(per_triangle.reshape(-1, 1, 3), 3, axis=1)
 

@@ -1,5 +1,7 @@
-"""Point instancers: where each prototype goes, from arrays that cannot be trusted."""
+"""Where prototypes go: levels of instancing, and point instancers, whose arrays cannot be trusted."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +11,61 @@ from warp_ir.scene import Floats, Ints
 from warp_ir.usd import value
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A prototype in all places that one native instance or point instancer gives it; the outermost is the world."""
+
+    key: Sdf.Path
+    """Of the prototype: levels with equal keys may hold the same."""
+    parent: "Level | None"
+    """The level in which the places are; None for the world."""
+    matrices: Floats
+    """parent_from_level, float64 [k, 4, 4]."""
+    colors: Floats | None = None
+    """displayColor of each place, float64 [k, 3], if there are such; the prims' own is stronger."""
+
+    @property
+    def total(self) -> int:
+        """In how many places of the world it is."""
+        return math.prod(len(level.matrices) for level in self.chain())
+
+    def chain(self) -> "list[Level]":
+        """From the world to this level."""
+        levels = [self]
+        while levels[-1].parent is not None:
+            levels.append(levels[-1].parent)
+        return levels[::-1]
+
+    def in_world(self) -> Floats:
+        """world_from_level for every place, float64 [total, 4, 4]."""
+        return combined(level.matrices for level in self.chain())
+
+    def colors_in_world(self) -> Floats | None:
+        """Colour (displayColor) for every place, float64 [total, 3]: the innermost level's that has any."""
+        return combined_colors((len(level.matrices), level.colors) for level in self.chain())
+
+
+def combined(matrices: Iterable[Floats]) -> Floats:
+    """Places [k, 4, 4] within places, outermost first: the product over all of them, the innermost running fastest."""
+    out = np.eye(4)[None]
+    for inner in matrices:
+        out = (out[:, None] @ inner[None]).reshape(-1, 4, 4)
+    return out
+
+
+def combined_colors(levels: Iterable[tuple[int, Floats | None]]) -> Floats | None:
+    """Colours of such places, given the number of places and the colours of each level, outermost first."""
+    out: Floats | None = None
+    total = 1
+    for count, colors in levels:
+        if colors is not None:
+            out = np.tile(colors, (total, 1))
+        elif out is not None:
+            out = np.repeat(out, count, axis=0)
+        total *= count
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from pxr import Tf, Usd
 
-from warp_ir.scene import InputError, Light, LightKind, Material, Mesh, Scene
+from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
-from warp_ir.usd.gprim import build_meshes
+from warp_ir.usd.gprim import Geometry, build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.linking import link
 from warp_ir.usd.motion import Motion
@@ -25,6 +25,7 @@ from warp_ir.usd.walk import Found, Site, walk
 _COUNTED = (
     "meshes",
     "triangles",
+    "triangles_seen",
     "materials",
     "images",
     "textures",
@@ -33,6 +34,8 @@ _COUNTED = (
     "instances",
     "native_instances",
     "point_instances",
+    "prototypes",
+    "prototype_places",
     "prims_invisible",
     "prims_other_purpose",
     "degenerate_faces",
@@ -45,7 +48,6 @@ _COUNTED = (
 _LEVELS = {"low": 0, "medium": 1, "high": 2, "veryhigh": 3}
 """How often `complexity` refines a subdivision surface, as usdrecord's complexities 1.0 to 1.3 do."""
 _PURPOSES = ("default", "render", "proxy", "guide")
-_Geometry = tuple[tuple[Mesh, ...], tuple[Material, ...]]
 _DRAWN = ("default", "render")
 """The purposes that are drawn if nobody says otherwise."""
 
@@ -234,16 +236,16 @@ class StageReader:
         still = self._still
         if still is None or self._motion.rearranges or key != still.key:
             still = self._still = self._walk(time, key)
-        meshes, materials = still.geometry
-        lights = still.lights
+        geometry, lights = still.geometry, still.lights
         report.include(still.report)
         if still.moving.shapes or still.moving.lights:
             moved = self._opened.part()
-            meshes, materials = self._with_moving(still.geometry, still.moving.shapes, time, moved)
+            geometry = self._with_moving(still.geometry, still.moving.shapes, time, moved)
             lights = lights + _lights(still.moving.lights, time, moved)
             moved.mention(self._moved)  # a shape that is known already does not tell again what it lacks
             report.include(moved)
             self._moved = moved
+        meshes, materials = geometry.meshes, geometry.materials
         if not meshes:
             hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
             report.warn("/", f"the stage draws no geometry{hint}")
@@ -252,12 +254,15 @@ class StageReader:
             lights = (_DOME,)
         stats = dict.fromkeys(_COUNTED, 0) | report.stats
         stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
-        stats["triangles"] = sum(len(mesh.triangles) for mesh in meshes)
         textures = {texture for material in materials for texture in material.textures}
         stats["textures"] = len(textures)
         stats["texels"] = sum(texture.pixels.shape[0] * texture.pixels.shape[1] for texture in textures)
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
-        scene = Scene(meshes, materials, link(self.stage, lights, meshes), name=report.source)
+        stats["prototypes"] = len(geometry.instances)
+        stats["prototype_places"] = sum(len(group.matrices) for group in geometry.instances)
+        lights = link(self.stage, lights, meshes)
+        scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
+        stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
         if view is None:
             along = "-Z" if self._axis == "Y" else "+Y"
             report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
@@ -282,9 +287,7 @@ class StageReader:
         report.include(read)
         return _Still(key, moving, geometry, lights, read, report)
 
-    def _with_moving(
-        self, still: "_Geometry", sites: Sequence[Site], time: Usd.TimeCode, report: Report
-    ) -> "_Geometry":
+    def _with_moving(self, still: Geometry, sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> Geometry:
         """All geometry: what stays, what only changes its place, whose shape is read once, and what changes itself."""
         bends = [self._motion.reshapes(site.prim) for site in sites]
         rigid = [site for site, b in zip(sites, bends, strict=True) if not b]
@@ -304,7 +307,7 @@ class _Still:
     """The purposes that are drawn, and whether it was at the default time."""
     moving: Found
     """What has to be read each time."""
-    geometry: _Geometry
+    geometry: Geometry
     lights: tuple[Light, ...]
     read: Report
     """Of the geometry and the lights that stay."""
@@ -312,19 +315,21 @@ class _Still:
     """The same and of the walk."""
 
 
-def _join(one: _Geometry, other: _Geometry) -> _Geometry:
-    """The meshes of both, one table of materials."""
-    materials = list(one[1]) if one[0] else []
+def _join(one: Geometry, other: Geometry) -> Geometry:
+    """The meshes and instances of both, one table of materials."""
+    materials = list(one.materials) if one.meshes else []
     known = {material: k for k, material in enumerate(materials)}
     index = []
-    for material in other[1] if other[0] else ():
+    for material in other.materials if other.meshes else ():
         if material not in known:
             known[material] = len(materials)
             materials.append(material)
         index.append(known[material])
     renamed = np.array(index, dtype=np.int32)
-    meshes = tuple(replace(mesh, material=renamed[mesh.material]) for mesh in other[0])
-    return (*one[0], *meshes), tuple(materials)
+    meshes = tuple(replace(mesh, material=renamed[mesh.material]) for mesh in other.meshes)
+    first = len(one.meshes)
+    instances = tuple(replace(group, meshes=tuple(first + k for k in group.meshes)) for group in other.instances)
+    return Geometry((*one.meshes, *meshes), (*one.instances, *instances), tuple(materials))
 
 
 def _lights(sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> tuple[Light, ...]:

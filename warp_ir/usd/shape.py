@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from warp_ir import placing
 from warp_ir.scene import Floats, Ints
 
 Mask = npt.NDArray[np.bool_]
@@ -95,35 +96,8 @@ def shaded(shape: Shape, normals: Floats) -> Shape:
 
 
 def place(shape: Shape, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
-    """Copies of a shape in the world.
-
-    Args:
-        shape: Triangles in their own space.
-        matrices: world_from_shape, float64 [k, 4, 4]; mirrored, sheared or flat ones are fine.
-
-    Returns:
-        Points float64 [k n, 3], triangles int32 [k m, 3] and normals float32 [k m, 3, 3] or None, copy after copy.
-    """
-    copies, count = len(matrices), len(shape.points)
-    linear = matrices[:, :3, :3]
-    points = np.matmul(shape.points, linear.transpose(0, 2, 1)) + matrices[:, None, :3, 3]
-    offsets = (np.arange(copies) * count).astype(np.int32)
-    triangles = shape.triangles[None] + offsets[:, None, None]
-    # Rows of the cofactor matrix, det · M⁻ᵀ, are cross products of rows: no inverse, so flat matrices pass.
-    mirrored = np.linalg.det(linear) < 0.0
-    triangles[mirrored] = triangles[mirrored][:, :, ::-1]
-    normals: Floats | None = None
-    if shape.normals is not None:
-        r0, r1, r2 = linear[:, 0], linear[:, 1], linear[:, 2]
-        cofactor = np.stack([np.cross(r1, r2), np.cross(r2, r0), np.cross(r0, r1)], axis=1)
-        cofactor[mirrored] *= -1.0
-        cofactor /= np.maximum(np.abs(cofactor).max(axis=(1, 2), keepdims=True), 1e-300)
-        normals = shape.normals.reshape(-1, 3) @ cofactor.transpose(0, 2, 1).astype(np.float32)
-        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
-        normals = normals.reshape(copies, -1, 3, 3)
-        normals[mirrored] = normals[mirrored][:, :, ::-1]
-        normals = normals.reshape(-1, 3, 3)
-    return points.reshape(-1, 3), triangles.reshape(-1, 3), normals
+    """Copies of a shape's points, triangles and normals: see `placing.place`."""
+    return placing.place(shape.points, shape.triangles, shape.normals, matrices)
 
 
 def _squared(vectors: Floats) -> Floats:

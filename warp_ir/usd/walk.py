@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
 
-from warp_ir.scene import Floats, InputError
+from warp_ir.scene import Floats
 from warp_ir.usd import value
 from warp_ir.usd.implicit import IMPLICIT
-from warp_ir.usd.instancing import read_instancer
+from warp_ir.usd.instancing import Level, read_instancer
 from warp_ir.usd.light import LIGHTS
 from warp_ir.usd.report import Report, Unreadable
 
@@ -18,10 +18,9 @@ _DEPTH = 16
 """Deepest nesting of point instancers that is followed."""
 _LIGHT_COPIES = 100_000
 """Most copies of one light."""
-_COPIES = 50_000_000
-"""Most copies of one gprim: what exceeds it is a mistake in the file, not a scene."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
+_WORLD = Level(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
 _SHAPES = {"Mesh", "TetMesh", *IMPLICIT}
 _DRAWN = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 # A prototype may live below an `over` or a `class`, which keeps it from being drawn where it stands.
@@ -33,12 +32,18 @@ class Site:
     """A prim and the places where it is drawn."""
 
     prim: Usd.Prim
-    matrices: Floats
-    """world_from_prim, float64 [k, 4, 4]."""
-    colors: Floats | None = None
-    """displayColor that an instancer gives to each copy, float64 [k, 3]; the prim's own is stronger."""
+    level: Level
+    """The prototype that it is part of; the outermost is the world."""
+    local: Floats
+    """level_from_prim, float64 [4, 4]."""
+
     lamp: Usd.Prim | None = None
     """The GeometryLight that makes a gprim emit, if there is one."""
+
+    @property
+    def matrices(self) -> Floats:
+        """world_from_prim for every place, float64 [k, 4, 4]."""
+        return self.level.in_world() @ self.local
 
 
 @dataclass(eq=False)
@@ -54,9 +59,9 @@ class _Visit:
     """A prim still to be visited, with what it inherits."""
 
     prim: Usd.Prim
-    matrices: Floats
+    level: Level
+    local: Floats
     purpose: object | None
-    colors: Floats | None
     instancers: tuple[Sdf.Path, ...]
 
 
@@ -64,9 +69,6 @@ def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: Collection[str], report
     """Visit every prim once per instancer that draws it, and gather gprims and lights.
 
     Invisible subtrees and gprims of other purposes are counted and left out.
-
-    Raises:
-        InputError: Nested instancers multiply beyond reason.
     """
     return _Walk(stage, time, purposes, report).run()
 
@@ -80,7 +82,7 @@ class _Walk:
         self._lamps: list[Usd.Prim] = []
 
     def run(self) -> Found:
-        root = _Visit(self._stage.GetPseudoRoot(), np.eye(4)[None], None, None, ())
+        root = _Visit(self._stage.GetPseudoRoot(), _WORLD, np.eye(4), None, ())
         pending = [root]
         while pending:  # a stack of our own: hierarchies may be deeper than Python's
             pending += reversed(self._visit(pending.pop()))
@@ -90,7 +92,7 @@ class _Walk:
     def _visit(self, visit: _Visit) -> list[_Visit]:
         """Gather one prim, and return what is below it."""
         prim, report = visit.prim, self._report
-        matrices, purpose = visit.matrices, visit.purpose
+        level, local, purpose = visit.level, visit.local, visit.purpose
         name = "default"
         if prim.IsA(UsdGeom.Imageable):
             imageable = UsdGeom.Imageable(prim)
@@ -99,13 +101,14 @@ class _Walk:
                 return []
             info = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
             name, purpose = info.purpose, info
-            matrices = self._placed(prim, matrices)
+            level, local = self._placed(prim, level, local)
         if prim.IsInstance():
             report.stats["native_instances"] += 1
+            level, local = Level(prim.GetPrototype().GetPath(), level, local[None]), np.eye(4)
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
-        site = Site(prim, matrices, visit.colors)
+        site = Site(prim, level, local)
         if kind == "PointInstancer":
-            return self._instances(visit, matrices, purpose)
+            return self._instances(visit, level, local, purpose)
         if kind in _SHAPES:
             if self._is_drawn(prim, name):
                 self._found.shapes.append(site)
@@ -131,22 +134,22 @@ class _Walk:
             # Levels of detail exclude each other; who cannot choose shows the default one.
             default = value.raw(prim.GetAttribute("lod:default:index"), self._time)
             children = children[default if isinstance(default, int) and 0 <= default < len(children) else 0 :][:1]
-        return [_Visit(child, matrices, purpose, visit.colors, visit.instancers) for child in children]
+        return [_Visit(child, level, local, purpose, visit.instancers) for child in children]
 
-    def _placed(self, prim: Usd.Prim, parents: Floats) -> Floats:
-        """world_from_prim for each place of the prim's parent."""
+    def _placed(self, prim: Usd.Prim, level: Level, parent: Floats) -> tuple[Level, Floats]:
+        """The level of a prim and its place in it, level_from_prim [4, 4], given those of its parent."""
         try:
             local, resets = self._transforms.GetLocalTransformation(prim)
         except Tf.ErrorException:
             self._report.warn(prim.GetPath(), "its transform cannot be read; the identity is used")
-            return parents
+            return level, parent
         matrix = np.array(local).T
         if not np.isfinite(matrix).all():
             self._report.warn(prim.GetPath(), "its transform is NaN or infinite; the identity is used")
-            return parents
+            return level, parent
         if resets:
-            return np.broadcast_to(matrix, parents.shape)
-        return parents if local == _IDENTITY else parents @ matrix
+            return _WORLD, matrix
+        return level, parent if local == _IDENTITY else parent @ matrix
 
     def _is_drawn(self, prim: Usd.Prim, purpose: str) -> bool:
         """Whether a prim's purpose is wanted, and not hidden by VisibilityAPI."""
@@ -162,8 +165,8 @@ class _Walk:
         return True
 
     def _add_light(self, site: Site) -> None:
-        if len(site.matrices) > _LIGHT_COPIES:
-            self._report.warn(site.prim.GetPath(), f"{len(site.matrices)} copies of a light: too many, it is left out")
+        if site.level.total > _LIGHT_COPIES:
+            self._report.warn(site.prim.GetPath(), f"{site.level.total} copies of a light: too many, it is left out")
         else:
             self._found.lights.append(site)
 
@@ -179,7 +182,7 @@ class _Walk:
             shapes = [replace(site, lamp=lamps.get(site.prim.GetPath())) for site in self._found.shapes]
             self._found.shapes = shapes
 
-    def _instances(self, visit: _Visit, matrices: Floats, purpose: object | None) -> list[_Visit]:
+    def _instances(self, visit: _Visit, level: Level, local: Floats, purpose: object | None) -> list[_Visit]:
         """The prototypes of a point instancer, each with all its places."""
         prim, report = visit.prim, self._report
         path = prim.GetPath()
@@ -200,15 +203,8 @@ class _Walk:
             if any(used.HasPrefix(group.prototype) for used in (*visit.instancers, path)):
                 report.warn(path, f"its prototype {group.prototype} contains the instancer itself; left out")
                 continue
-            outer, inner = len(matrices), len(group.matrices)
-            if outer * inner > _COPIES:
-                raise InputError(f"{report.source}: {path}: nested instancers make {outer * inner} copies")
-            report.stats["point_instances"] += outer * inner
-            places = (matrices[:, None] @ group.matrices[None]).reshape(-1, 4, 4)
-            colors: Floats | None
-            if group.colors is not None:
-                colors = np.tile(group.colors, (outer, 1))
-            else:
-                colors = None if visit.colors is None else np.repeat(visit.colors, inner, axis=0)
-            below.append(_Visit(prototype, places, purpose, colors, (*visit.instancers, path)))
+            report.stats["point_instances"] += level.total * len(group.matrices)
+            key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
+            inner = Level(key, level, local @ group.matrices, group.colors)
+            below.append(_Visit(prototype, inner, np.eye(4), purpose, (*visit.instancers, path)))
         return below
