@@ -431,9 +431,9 @@ def test_compare_needs_light_and_time(tmp_path, capsys):
     assert "--reference-time: one iteration" in error_of(capsys, "compare", ROOM, *COMPARE, "--reference-time", "1e-9")
 
 
-@pytest.mark.parametrize(("after", "rows"), [(0, 0), (3, 0), (5, 2)])
+@pytest.mark.parametrize(("after", "rows"), [(0, 0), (4, 0), (6, 2)])
 def test_compare_interrupted(tmp_path, capsys, monkeypatch, after, rows):
-    """A signal ends in what there is: after the reference and two warm-ups every render is a row."""
+    """A signal ends in what there is: after the reference, its scale and two warm-ups every render is a row."""
     renders = []
     render = warp_ir.Renderer.render
 

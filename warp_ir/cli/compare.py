@@ -2,7 +2,8 @@
 
 The reference is a long render by `path`, which shares no transport with what it judges. Its own relative
 mean squared error, known from its standard error, is the floor: it is subtracted from what is measured, and
-what lies far below it cannot be told apart.
+what lies far below it cannot be told apart. What errors are relative to is another picture, smooth and without
+the noise of the reference: where that is too dark by chance it would weigh its own noise most.
 """
 
 import argparse
@@ -44,6 +45,8 @@ class Reference:
     """Linear radiance, [height, width, 3]."""
     standard_error: Any
     """Of `picture`, the same shape."""
+    scale: Any
+    """What errors are relative to: a smooth picture, without the noise of `picture`, the same shape."""
     floor: float
     """Its own relative mean squared error."""
     seconds: float
@@ -161,8 +164,10 @@ class _Job:
         picture, error = film.radiance(), film.standard_error()
         if not picture.mean() > 0.0:
             raise InputError(f"{self.args.stage}: the picture is black; no error is relative to it")
-        floor = -relative_mse(picture, picture, reference_error=error)
-        return Reference(picture, error, floor, film.seconds, film.iterations, seed)
+        # Noise must not weigh itself. A weight may be a little wrong, so that any smooth picture will do.
+        scale = self._render("vpl", max(self.args.times), seed, "smooth picture").radiance()
+        floor = -relative_mse(picture, picture, reference_error=error, scale=scale)
+        return Reference(picture, error, scale, floor, film.seconds, film.iterations, seed)
 
     def runs(self, methods: Sequence[str], reference: Reference) -> Iterator[Run]:
         """A picture by each of the methods in turn, for every seed and time."""
@@ -180,7 +185,7 @@ class _Job:
                         continue  # one iteration has outlasted this limit already: it would be the same picture
                     film = self._render(method, limit, seed, f"{method}, {limit:g} s ({number}/{total})")
                     x, r = film.radiance(), reference.picture
-                    error = relative_mse(x, r, reference_error=reference.standard_error)
+                    error = relative_mse(x, r, reference_error=reference.standard_error, scale=reference.scale)
                     measured = Run(method, limit, seed, film.seconds, film.iterations, error, mean_ratio(x, r))
                     last[method, seed] = measured
                     yield measured
