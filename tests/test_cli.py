@@ -16,7 +16,7 @@ import pytest
 import warp_ir
 import warp_ir.usd.load
 from warp_ir import RenderSettings
-from warp_ir.cli import main
+from warp_ir.cli import compare, main
 from warp_ir.cli.arguments import parse, settings_of
 from warp_ir.cli.console import ProgressDisplay, describe_progress, say_warnings
 from warp_ir.cli.frames import outputs_of
@@ -247,6 +247,16 @@ def test_interruption_while_loading(tmp_path, monkeypatch, capsys, number, code)
         (["info", "missing.usda"], "missing.usda: no such file"),
         (["vpls", ROOM, "a.exr"], "unknown extension '.exr'; known are .png .usda .npz"),
         (["vpls", ROOM, "a.npz", "--iteration", "-1"], "--iteration: must be at least 0"),
+        (["compare", ROOM, "a.exr"], "a.exr: unknown extension '.exr'; known are .png"),
+        (["compare", ROOM, "--json", "a.txt"], "a.txt: unknown extension '.txt'; known are .json"),
+        (["compare", ROOM, "--times", "1,0"], "--times: must be more than 0 seconds, is 0"),
+        (["compare", ROOM, "--times", "1,,2"], "--times: not a number: ''"),
+        (["compare", ROOM, "--seeds", "0"], "--seeds: must be a whole number from 1 to 1000, is '0'"),
+        (["compare", ROOM, "--methods", "vpl, magic"], "unknown 'magic'; known are vpl, vpl without filter"),
+        (["compare", ROOM, "--methods", ","], "--methods: names none"),
+        (["compare", ROOM, "--iterations", "4"], "unrecognized arguments: --iterations 4"),
+        (["compare", ROOM, "--width", "0"], "--width: must be a whole number of at least 1, is 0"),
+        (["compare", "missing.usda"], "missing.usda: no such file"),
         (["render", ROOM, "a.png", "--purposes", "final"], "unknown 'final'; known are default, render"),
         (["render", ROOM, "a.png", "--wid", "8"], "unrecognized arguments: --wid 8"),
     ],
@@ -352,6 +362,135 @@ def test_vpls_picture(tmp_path):
     assert len(np.unique(read_image(tmp_path / "v.png").reshape(-1, 3), axis=0)) > 10
 
 
+# ---- compare ---------------------------------------------------------------------------------------------
+
+COMPARE = ["--width", "8", "--light-paths", "16", "--device", "cpu", "--times", "0.03,0.06", "--reference-time", "0.4"]
+ROW = r"(\S.*?)  +([\d.e-]+)  +(\d+)  +(<?) ?([\d.e-]+)  +([+-][\d.]+) %"
+
+
+def test_compare_prints_a_table(tmp_path, capsys):
+    """The table, the recommendation and the JSON say the same; a method is judged against `path` of another seed."""
+    command = ["compare", ROOM, "--json", str(tmp_path / "c.json"), *COMPARE, "--methods", "path,vpl", "--seed", "7"]
+    assert main(command) == 0
+    first, head, *table, last = capsys.readouterr().out.splitlines()
+    found = json.loads((tmp_path / "c.json").read_text())
+    reference = found["reference"]
+    assert re.fullmatch(rf"reference: path, {reference['iterations']} iterations in .* s; its own relMSE, .*", first)
+    assert reference["seed"] == 8 and reference["floor"] > 0.0 and reference["iterations"] >= 2
+    assert head.split() == ["method", "seconds", "iterations", "relMSE", "mean", "ratio"]
+    rows = [re.fullmatch(ROW, line.strip()).groups() for line in table]
+    assert [row[0] for row in rows] == [row["method"] for row in found["medians"]] and rows[-1][0] == "path"
+    for cells, row in zip(rows, found["medians"], strict=True):
+        assert (float(cells[1]), int(cells[2])) == (float(f"{row['seconds']:.3g}"), row["iterations"])
+        resolution = 0.05 * reference["floor"]
+        assert (cells[3] == "<") == (row["error"] <= resolution)
+        assert float(cells[4]) == float(f"{max(row['error'], resolution):.2g}")
+    assert {run["seed"] for run in found["runs"]} == {7} and found["interrupted"] is False
+    recommended = found["recommended"]
+    assert last.startswith(f"use {recommended['method']} (") and "relMSE 0.01 " in last and "relMSE 0.001 " in last
+
+
+def test_compare_medians_over_seeds(tmp_path, capsys):
+    """Every seed is a run of its own, and the rows are the medians."""
+    command = ["compare", ROOM, "-q", "--json", str(tmp_path / "c.json"), *COMPARE, "--methods", "vpl", "--seeds", "3"]
+    assert main(command) == 0
+    found = json.loads((tmp_path / "c.json").read_text())
+    assert found["reference"]["seed"] == 3 and {run["seed"] for run in found["runs"]} == {0, 1, 2}
+    for row in found["medians"]:
+        errors = [run["error"] for run in found["runs"] if run["time_limit"] == row["time_limit"]]
+        assert row["error"] == np.median(errors) and len(set(errors)) > 1
+    assert capsys.readouterr().err == ""
+
+
+def test_compare_plots(tmp_path):
+    """OUTPUT.png is a picture with more than one colour in it."""
+    pytest.importorskip("matplotlib")
+    assert main(["compare", ROOM, str(tmp_path / "c.png"), *COMPARE, "--methods", "path,vpl"]) == 0
+    assert len(np.unique(read_image(tmp_path / "c.png").reshape(-1, 3), axis=0)) > 10
+
+
+def test_compare_without_extras(tmp_path, capsys, monkeypatch):
+    """A plot without Matplotlib is an error that names the extra; without the denoiser its method is left out."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    assert "pip install 'warp-ir[bench]'" in error_of(capsys, "compare", ROOM, str(tmp_path / "c.png"))
+    assert "pip install 'warp-ir[denoise]'" in error_of(capsys, "compare", ROOM, "--methods", "vpl denoised")
+    assert main(["compare", ROOM, *COMPARE, "--times", "0.02"]) == 0
+    captured = capsys.readouterr()
+    assert "vpl denoised is left out: Open Image Denoise is not installed" in captured.err
+    methods = [re.fullmatch(ROW, line.strip())[1] for line in captured.out.splitlines()[2:-1]]
+    assert methods == ["vpl", "vpl without filter", "keller", "path"]
+
+
+def test_compare_needs_light_and_time(tmp_path, capsys):
+    """A black picture, and a reference without a standard error, are errors."""
+    (tmp_path / "a.usda").write_text(DARK % "0")
+    error = error_of(capsys, "compare", str(tmp_path / "a.usda"), *COMPARE, "-q", "--default-light", "none")
+    assert "the picture is black" in error
+    assert "--reference-time: one iteration" in error_of(capsys, "compare", ROOM, *COMPARE, "--reference-time", "1e-9")
+
+
+@pytest.mark.parametrize(("after", "rows"), [(0, 0), (4, 0), (6, 2)])
+def test_compare_interrupted(tmp_path, capsys, monkeypatch, after, rows):
+    """A signal ends in what there is: after the reference, its scale and two warm-ups every render is a row."""
+    renders = []
+    render = warp_ir.Renderer.render
+
+    def stopped(self, film=None, progress=None):
+        renders.append(self)
+        film = render(self, film, progress)
+        film.interrupted = signal.SIGTERM if len(renders) > after else 0
+        return film
+
+    monkeypatch.setattr(warp_ir.Renderer, "render", stopped)
+    command = ["compare", ROOM, "--json", str(tmp_path / "c.json"), *COMPARE, "--methods", "path,vpl"]
+    assert main(command) == 143 and len(renders) == after + 1
+    captured = capsys.readouterr()
+    assert "interrupted" in captured.err
+    assert sum(re.fullmatch(ROW, line.strip()) is not None for line in captured.out.splitlines()) == rows
+    assert (tmp_path / "c.json").exists() == (rows > 0)
+
+
+def test_compare_interrupted_between_renders(capsys, monkeypatch):
+    """So does Ctrl-C while no render is there to notice it."""
+    measured = []
+
+    def measure(*args, **kwargs):
+        measured.append(args)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        return 0.5
+
+    monkeypatch.setattr(compare, "mean_ratio", measure)
+    assert main(["compare", ROOM, *COMPARE, "--methods", "path,vpl"]) == 130
+    captured = capsys.readouterr()
+    assert captured.out.count("+50.00 %") == 2 and "interrupted: the table holds" in captured.err
+
+
+def curve(method, *points):
+    return [compare.Run(method, t, None, t, 1, error, 0.0) for t, error in points]
+
+
+def test_compare_recommends_the_smallest_error():
+    """Errors that fall as 1/t and as 1/√t, in closed form; what the reference cannot tell apart is level."""
+    fast, slow = curve("path", (1.0, 0.04), (4.0, 0.01)), curve("vpl", (1.0, 0.012), (4.0, 0.006))
+    verdict = compare.judge([*slow, *fast], 1e-6)
+    assert (verdict.method, verdict.flags, verdict.level) == ("vpl", "", [])
+    between, beyond = verdict.seconds[0.01], verdict.seconds[0.001]
+    assert between[1] and between[0] == pytest.approx(4.0 ** (math.log(1.2) / math.log(2.0)))
+    assert not beyond[1] and beyond[0] == pytest.approx(4.0 * 6.0**2)
+    assert compare.seconds_to(0.001, [(1.0, 0.04), (4.0, 0.01)]) == pytest.approx((40.0, False))
+    assert compare.seconds_to(0.001, [(1.0, 0.02), (4.0, 0.02)]) is None
+    assert compare.seconds_to(0.001, [(1.0, 0.06), (4.0, 0.06 / 1.1)]) is None
+    assert compare.seconds_to(1e-9, [(1.0, 1e60), (4.0, 0.9e60)]) is None  # no overflow
+    level = compare.judge([*slow, *fast], 0.02)
+    assert (level.method, level.level) == ("vpl", ["path"])
+    late = [compare.Run("keller", 1.0, None, 40.0, 1, 0.001, 0.0)]  # 0.01 at 4 s, as iterations are independent
+    assert compare.judge([*slow, *late], 1e-6).method == "vpl"
+    assert "relMSE 0.001 in about 2.4 min" in compare.in_words(verdict, 4.0)
+
+
 # ---- arguments -------------------------------------------------------------------------------------------
 
 
@@ -359,7 +498,7 @@ def test_help_imports_nothing_heavy():
     """--help is there at once: Warp, USD, pictures and drawing stay unloaded."""
     code = """
 import sys
-from warp_ir.cli import main
+from warp_ir.cli import compare, main
 try:
     main(["render", "--help"])
 except SystemExit as end:
@@ -371,7 +510,7 @@ except SystemExit as end:
     assert "examples:" in done.stdout and "--estimator" in done.stdout
 
 
-@pytest.mark.parametrize("command", ["render", "info", "vpls"])
+@pytest.mark.parametrize("command", ["render", "info", "vpls", "compare"])
 def test_help_fits_a_terminal(command, capsys, monkeypatch):
     """80 columns suffice."""
     monkeypatch.setenv("COLUMNS", "80")

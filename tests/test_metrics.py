@@ -69,3 +69,18 @@ def test_wrong_input_is_named():
         relative_mse(np.ones(3), np.zeros(3))
     with pytest.raises(InputError, match="black"):
         mean_ratio(np.ones(3), np.zeros(3))
+
+
+def test_scale_keeps_noise_from_weighing_itself():
+    """Skewed noise in the reference: with a clean scale the error is the true one, without it far above.
+
+    The reference is the mean of 4 exponential samples of 1, the image 1.1 everywhere: its error is 0.01 / 1.01.
+    The estimate is the mean of (x − r)² − se² over 1.01; its own standard error follows from the sample.
+    """
+    samples = np.random.default_rng(3).exponential(size=(4, 100_000))
+    r, se = samples.mean(axis=0), samples.std(axis=0, ddof=1) / 2.0
+    x, one = np.full_like(r, 1.1), np.ones_like(r)
+    sigma = np.std(((x - r) ** 2 - se**2) / 1.01) / np.sqrt(r.size)
+    truth = 0.01 / 1.01
+    assert abs(relative_mse(x, r, reference_error=se, scale=one) - truth) < 4.0 * sigma
+    assert relative_mse(x, r, reference_error=se) > truth + 40.0 * sigma

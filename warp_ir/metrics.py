@@ -13,7 +13,9 @@ from warp_ir.scene import InputError
 Array = npt.NDArray[np.floating]
 
 
-def relative_mse(image: Array, reference: Array, *, reference_error: Array | None = None) -> float:
+def relative_mse(
+    image: Array, reference: Array, *, reference_error: Array | None = None, scale: Array | None = None
+) -> float:
     """Mean of (x − r)² / (r² + 0.01·m²) over pixels and channels, with m the mean of the reference r.
 
     The second term of the denominator keeps black pixels from deciding alone; a scene twice as bright
@@ -24,15 +26,18 @@ def relative_mse(image: Array, reference: Array, *, reference_error: Array | Non
         reference: Linear radiance r, the same shape.
         reference_error: The reference's own standard error, the same shape. What it adds to the result
             is subtracted; a picture as good as the reference then scores around 0, below as well as above.
+        scale: Stands for r in the denominator, the same shape. Where a noisy r is too dark by chance it weighs
+            its own error most, and more than its standard error knows; a smooth picture without that noise does not.
 
     Raises:
         InputError: The shapes differ, or the reference is black.
     """
     x, r = _pair(image, reference)
-    m = r.mean()
+    d = r if scale is None else _pair(scale, reference)[0]
+    m = d.mean()
     if not m > 0.0:
         raise InputError("relative_mse: the reference is black; no error is relative to it")
-    weight = 1.0 / (r * r + 0.01 * m * m)
+    weight = 1.0 / (d * d + 0.01 * m * m)
     error = float(np.mean((x - r) ** 2 * weight))
     if reference_error is not None:
         noise, _ = _pair(reference_error, reference)

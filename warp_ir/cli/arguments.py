@@ -31,6 +31,16 @@ _LONG_CHOICE = 40
 """Characters beyond which the choices of a setting do not stand in for its value, but in the text beside it."""
 LISTS = ("cameras", "lights", "materials", "settings")
 """What `warp-ir info --list` can list."""
+METHODS: Mapping[str, Mapping[str, Any]] = {
+    "vpl": {},
+    "vpl without filter": {"filter": False},
+    "vpl denoised": {"denoise": True},
+    "keller": {"estimator": "keller"},
+    "path": {"estimator": "path"},
+}
+"""What `warp-ir compare` compares: names, and the settings that are not the default."""
+_COMPARED = ("iterations", "time_limit", "target_error", "estimator", "filter", "denoise")
+"""Settings that are for `warp-ir compare` to choose."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
@@ -64,6 +74,19 @@ examples:
   # NumPy arrays: positions, normals, intensity, bounce, directional
   warp-ir vpls room.usda cloud.npz --iteration 3
 """
+_COMPARE_NOTES = """\
+relMSE is the mean of (x - r)^2 / (r^2 + 0.01 m^2), with r the reference and m
+its mean: a scene twice as bright has the same. Ctrl-C tells what there is.
+
+examples:
+  # a table, and which settings to use
+  warp-ir compare room.usda
+  # also as a plot, for a small picture and longer renders
+  warp-ir compare room.usda error.png --width 256 --times 2,8,32
+  # only these, thrice, against a better reference
+  warp-ir compare room.usda --methods 'vpl, path' --seeds 3 \\
+      --reference-time 600
+"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -91,6 +114,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
         ("info", "show what is in a stage, what will be skipped, and why", "", _add_info),
         ("vpls", "write the virtual point lights: as picture, USD points or arrays", _VPLS_NOTES, _add_vpls),
+        ("compare", "error against time of each method, and which one to use", _COMPARE_NOTES, _add_compare),
     ):
         command = commands.add_parser(
             name,
@@ -211,6 +235,24 @@ def _add_vpls(parser: argparse.ArgumentParser) -> None:
     )
     cloud.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
     _add_device(cloud)
+    _add_stage(parser, frames=False)
+
+
+def _add_compare(parser: argparse.ArgumentParser) -> None:
+    plot = ".png to plot error against time in (needs the extra 'bench')"
+    parser.add_argument("output", metavar="OUTPUT", nargs="?", help=plot)
+    what = parser.add_argument_group("comparison")
+    times = "how long each method renders, in seconds (default: 0.5,1,2,4)"
+    what.add_argument("--times", type=_times, default=[0.5, 1.0, 2.0, 4.0], metavar="S[,S]", help=times)
+    long = "how long path renders the reference (default: ten times the longest of --times)"
+    what.add_argument("--reference-time", type=_duration, metavar="SECONDS", help=long)
+    names = f"what to compare: {', '.join(METHODS)} (default: all that are installed)"
+    what.add_argument("--methods", type=_names(METHODS), metavar="NAME[,NAME]", help=names)
+    what.add_argument("--seeds", type=_count, default=1, metavar="N", help="pictures of each, for medians (default: 1)")
+    what.add_argument("--json", metavar="FILE.json", help="write all numbers")
+    what.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
+    _add_device(what)
+    _add_settings(parser.add_argument_group("picture"), [name for name in _FIELDS if name not in _COMPARED])
     _add_stage(parser, frames=False)
 
 
@@ -348,6 +390,23 @@ def _seconds(text: str) -> float:
     if value < 0.0:
         raise argparse.ArgumentTypeError("must be at least 0")
     return value
+
+
+def _duration(text: str) -> float:
+    value = _finite(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"must be more than 0 seconds, is {text.strip()}")
+    return value
+
+
+def _times(text: str) -> list[float]:
+    return sorted({_duration(word) for word in text.split(",")})
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text[:9]) <= 1000:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, is {text!r}")
+    return int(text)
 
 
 def _stops(text: str) -> float:
