@@ -53,13 +53,14 @@ def read_material(
         if not source:
             continue
         shader = UsdShade.ConnectableAPI(source)
-        identifier = UsdShade.Shader(source).GetShaderId() or "an unnamed shader"
+        identifier = UsdShade.Shader(source).GetShaderId()
         read = _READERS.get(identifier)
         if read is not None:
             return read(_Inputs(shader, Network(images, path, time), black_metals))
         known.append(identifier)
     outputs = [str(o.GetFullName()) for o in material.GetSurfaceOutputs() if o.HasConnectedSource()]
-    what = f"its shader {known[0]} is not understood" if known else f"it offers only {', '.join(outputs)}"
+    shown = (known[0] or "without an id") if known else ""
+    what = f"its shader {shown} is not understood" if known else f"it offers only {', '.join(outputs)}"
     if not known and not outputs:
         what = "it has no surface shader"
     raise Unreadable(f"{what}; displayColor is used")
