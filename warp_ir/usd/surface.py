@@ -124,7 +124,8 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
-    return _surface(inputs, _metal(inputs, "metalness", albedo), emission, inputs.grey("opacity", 1.0), 0.0)
+    albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
+    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0)
 
 
 def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
@@ -133,8 +134,8 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
-    opacity = inputs.grey("geometry_opacity", 1.0)
-    return _surface(inputs, _metal(inputs, "base_metalness", albedo), emission, opacity, 0.0)
+    albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
+    return _surface(inputs, albedo, emission, inputs.grey("geometry_opacity", 1.0), 0.0)
 
 
 _READERS = {
@@ -165,6 +166,20 @@ def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
         return albedo
     inputs.warn("metal rendered without its reflection ({n} materials)")
     return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
+
+
+def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
+    """The albedo below a coat, whose colour filters what comes back: lacquered metals get theirs from it."""
+    coat = inputs.grey(weight, 0.0)
+    if coat.pixels.max() <= 0.0:
+        return albedo
+    tint = inputs.color("coat_color", _WHITE)
+    if tint.pixels.min() >= 1.0:
+        return albedo
+    if albedo.primvar:
+        inputs.warn(f"coat_color does not tint the primvar '{albedo.primvar}'")
+        return albedo
+    return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _unit(t))), albedo, coat, tint)
 
 
 def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float) -> Surface | None:
