@@ -213,6 +213,32 @@ def test_interruption_while_loading(tmp_path, monkeypatch, capsys, number, code)
     assert capsys.readouterr().err in ("warp-ir: interrupted\n", "warp-ir: terminated\n")
 
 
+IMPORTING = """
+import importlib.abc, os, signal, sys
+
+class Interrupting(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "pxr.Gf":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), getattr(signal, sys.argv[1]))
+
+sys.meta_path.insert(0, Interrupting())
+from warp_ir.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+"""A `warp-ir` that is interrupted while one of USD's modules imports another."""
+
+
+@pytest.mark.parametrize(("number", "said"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+@pytest.mark.parametrize("command", [["info", ROOM], ["render", TURNTABLE, "#.png", "--frames", "1:2"]])
+def test_interruption_while_importing(tmp_path, number, said, command):
+    """USD swallows what is raised while its modules import each other; the command still ends, in one line."""
+    process = [sys.executable, "-c", IMPORTING, number.name, *command]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(process, capture_output=True, text=True, timeout=60, cwd=tmp_path, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", f"warp-ir: {said}\n")
+
+
 # ---- errors ----------------------------------------------------------------------------------------------
 
 

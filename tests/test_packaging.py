@@ -48,7 +48,7 @@ def test_readme_render_command_parses():
 
 
 @pytest.mark.parametrize(
-    "name", ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/api.md", "benchmarks/README.md"]
+    "name", ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/api.md", "docs/usd.md", "benchmarks/README.md"]
 )
 def test_links_lead_somewhere(name):
     """Every relative link is a file, pictures included."""

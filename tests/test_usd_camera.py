@@ -156,6 +156,25 @@ def Cube "C" {{
     assert warned(scene, "no camera", "-Z" if axis == "Y" else "+Y")
 
 
+@pytest.mark.parametrize(("axis", "size"), [("Y", (1, 4, 2)), ("Z", (1, 2, 4)), ("Y", (4, 1, 2)), ("Y", (1, 1.6, 1))])
+def test_all_of_the_scene_is_framed(tmp_path, axis, size):
+    """Every corner of a box lies in the window, and a tall box fills its height."""
+    scene = load(tmp_path, f"""(upAxis = "{axis}")
+def Cube "C" {{
+    double size = 1
+    double3 xformOp:scale = {size}
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+}}""")  # fmt: skip
+    corners = np.array([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    corners[:, :3] *= size
+    seen = corners @ np.linalg.inv(scene.camera.world_from_camera).T
+    x, y = (np.abs(seen[:, k] / seen[:, 2]).max() for k in (0, 1))
+    assert x <= scene.camera.window[1] * (1 + 1e-9) and y <= scene.camera.window[3] * (1 + 1e-9)
+    height = size[1] if axis == "Y" else size[2]
+    if height > 1.7 * size[0]:
+        assert y == pytest.approx(scene.camera.window[3])
+
+
 def test_a_tiny_scene_is_framed_from_beyond_the_near_plane(tmp_path):
     """As in usdrecord, the camera steps back by 1 where it would stand closer than its near plane."""
     distance = load(tmp_path, 'def Cube "C" { double size = 0.01\n}').camera.world_from_camera[2, 3]

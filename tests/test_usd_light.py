@@ -212,6 +212,7 @@ SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
         ("PortalLight", "", "", "portals"),
         ("GeometryLight", "", "", "geometry"),
         ("PluginLight", "", "", "PluginLight"),
+        ("LightFilter", "", "", "light filters are not read"),
     ],
 )
 def test_what_is_not_honoured_is_named(tmp_path, kind, head, more, word):

@@ -165,6 +165,18 @@ def test_textures_are_replaced_by_their_fallback(tmp_path, fallback, albedo):
         ),
         ("ND_standard_surface_surfaceshader", "", (0.8, 0.8, 0.8), (0, 0, 0)),
         (
+            "ND_standard_surface_surfaceshader",
+            "color3f inputs:base_color = (1, 1, 1)\n float inputs:coat = 0.5\n color3f inputs:coat_color = (1, 0.6, 0)",
+            (1, 0.8, 0.5),
+            (0, 0, 0),
+        ),
+        (
+            "ND_open_pbr_surface_surfaceshader",
+            "float inputs:coat_weight = 1\n color3f inputs:coat_color = (0.5, 1, 0)",
+            (0.4, 0.8, 0),
+            (0, 0, 0),
+        ),
+        (
             "ND_open_pbr_surface_surfaceshader",
             "float inputs:base_weight = 0.5\n float inputs:emission_luminance = 2",
             (0.4, 0.4, 0.4),
@@ -173,7 +185,7 @@ def test_textures_are_replaced_by_their_fallback(tmp_path, fallback, albedo):
     ],
 )
 def test_inline_materialx(tmp_path, shader, inputs, albedo, emission):
-    """Base and emission of the MaterialX surfaces are read where no universal surface is offered."""
+    """Base, coat and emission of the MaterialX surfaces are read where no universal surface is offered."""
     material = only_material(load(tmp_path, material_text(inputs, shader=shader, output="mtlx:surface") + BOUND))
     assert material.albedo == pytest.approx(albedo) and material.emission == pytest.approx(emission)
 

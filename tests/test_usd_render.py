@@ -389,3 +389,12 @@ def test_wrong_types_and_values_are_survived(tmp_path):
         RenderSettings(**scene.settings)
         loaded += 1
     assert loaded > 60
+
+
+@pytest.mark.parametrize(("looks", "said"), [('"full", ""', 0), ('"full", "allPurpose"', 0), ('"preview"', 1)])
+def test_which_materials_settings_ask_for(tmp_path, looks, said):
+    """Only what differs from the schema's own choice, which many files write with a word for "", is named."""
+    text = f'def RenderSettings "S" {{\n    uniform token[] materialBindingPurposes = [{looks}]\n}}\n'
+    (tmp_path / "a.usda").write_text(f"#usda 1.0\n{ROOM}\n{text}")
+    warnings = load_usd(tmp_path / "a.usda", camera="A").warnings
+    assert sum("materialBindingPurposes" in line for line in warnings) == said

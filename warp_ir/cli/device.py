@@ -1,6 +1,7 @@
 """Which device a command runs on."""
 
 from warp_ir.cli.console import muted_stderr
+from warp_ir.cli.signals import signals_wait
 from warp_ir.scene import InputError
 
 
@@ -14,7 +15,8 @@ def open_device(name: str, *, verbose: bool = False) -> str:
     Raises:
         InputError: There is no such device; the message names those that there are.
     """
-    import warp as wp
+    with signals_wait():
+        import warp as wp
 
     # This process is ours: Warp reports through our messages, or not at all.
     wp.config.log_level = wp.LOG_INFO if verbose else wp.LOG_ERROR

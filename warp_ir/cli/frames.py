@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+from warp_ir.cli.signals import signals_wait
 from warp_ir.scene import InputError
 
 Moment = float | str | None
@@ -38,7 +39,8 @@ def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Pa
 
 def time_codes(spec: str) -> list[float]:
     """The numbers of a frame specification, without repetitions."""
-    from pxr import Tf, UsdUtils
+    with signals_wait():
+        from pxr import Tf, UsdUtils
 
     codes: dict[float, None] = {}
     for part in spec.split(","):

@@ -3,6 +3,8 @@
 import argparse
 from typing import Any
 
+from warp_ir.cli.signals import signals_wait
+
 
 def open_reader(args: argparse.Namespace) -> Any:
     """The `StageReader` that the flags of the group "stage" want.
@@ -10,7 +12,8 @@ def open_reader(args: argparse.Namespace) -> Any:
     Raises:
         InputError: The stage cannot be opened.
     """
-    from warp_ir.usd.load import StageReader
+    with signals_wait():
+        from warp_ir.usd.load import StageReader
 
     return StageReader(
         args.stage,

@@ -126,6 +126,8 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
 def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
     """The camera with which `usdrecord` shows a stage that has none (its `_ComputeCameraToFrameStage`).
 
+    What is tall, usdrecord cuts off above and below; this camera steps back until all of it is in the picture.
+
     Args:
         lower: Corner of the scene's bounds, [3].
         upper: The opposite corner.
@@ -136,7 +138,7 @@ def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
     half_y = 0.5 * default.verticalAperture / default.focalLength
     size, matrix = upper - lower, np.eye(4)
     width, height, depth = (size[0], size[1], size[2]) if up_axis == "Y" else (size[0], size[2], size[1])
-    distance = 0.5 * math.hypot(width, height) / half_x + 0.5 * depth
+    distance = 0.5 * max(math.hypot(width, height) / half_x, height / half_y) + 0.5 * depth
     if distance < default.clippingRange.min:
         distance += 1.0
     if up_axis == "Z":

@@ -102,6 +102,8 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
     _warn_of_color(chosen, time, report)
     bindings = UsdRender.Settings(chosen).GetMaterialBindingPurposesAttr()
     looks = value.tokens(bindings, time) if bindings.HasAuthoredValue() else _LOOKS
+    # The schema calls "" so in a sentence, and many files quote it.
+    looks = ["" if name == "allPurpose" else name for name in looks]
     if looks != _LOOKS:
         report.warn(chosen.GetPath(), f"materialBindingPurposes {looks}: materials of purpose 'full' are used first")
     return RenderSpec(

@@ -53,13 +53,14 @@ def read_material(
         if not source:
             continue
         shader = UsdShade.ConnectableAPI(source)
-        identifier = UsdShade.Shader(source).GetShaderId() or "an unnamed shader"
+        identifier = UsdShade.Shader(source).GetShaderId()
         read = _READERS.get(identifier)
         if read is not None:
             return read(_Inputs(shader, Network(images, path, time), black_metals))
         known.append(identifier)
     outputs = [str(o.GetFullName()) for o in material.GetSurfaceOutputs() if o.HasConnectedSource()]
-    what = f"its shader {known[0]} is not understood" if known else f"it offers only {', '.join(outputs)}"
+    shown = (known[0] or "without an id") if known else ""
+    what = f"its shader {shown} is not understood" if known else f"it offers only {', '.join(outputs)}"
     if not known and not outputs:
         what = "it has no surface shader"
     raise Unreadable(f"{what}; displayColor is used")
@@ -123,7 +124,8 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
-    return _surface(inputs, _metal(inputs, "metalness", albedo), emission, inputs.grey("opacity", 1.0), 0.0)
+    albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
+    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0)
 
 
 def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
@@ -132,8 +134,8 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
-    opacity = inputs.grey("geometry_opacity", 1.0)
-    return _surface(inputs, _metal(inputs, "base_metalness", albedo), emission, opacity, 0.0)
+    albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
+    return _surface(inputs, albedo, emission, inputs.grey("geometry_opacity", 1.0), 0.0)
 
 
 _READERS = {
@@ -164,6 +166,20 @@ def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
         return albedo
     inputs.warn("metal rendered without its reflection ({n} materials)")
     return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
+
+
+def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
+    """The albedo below a coat, whose colour filters what comes back: lacquered metals get theirs from it."""
+    coat = inputs.grey(weight, 0.0)
+    if coat.pixels.max() <= 0.0:
+        return albedo
+    tint = inputs.color("coat_color", _WHITE)
+    if tint.pixels.min() >= 1.0:
+        return albedo
+    if albedo.primvar:
+        inputs.warn(f"coat_color does not tint the primvar '{albedo.primvar}'")
+        return albedo
+    return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _unit(t))), albedo, coat, tint)
 
 
 def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float) -> Surface | None:

@@ -123,7 +123,9 @@ class _Walk:
         elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
             if self._is_drawn(prim, name):
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
-        elif prim.HasAPI(UsdLux.LightAPI) or kind in ("PluginLight", "LightFilter", "PluginLightFilter"):
+        elif kind in ("LightFilter", "PluginLightFilter"):
+            report.warn(prim.GetPath(), "light filters are not read")
+        elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
             report.warn(prim.GetPath(), f"{kind} is not read yet: it emits nothing")
         if prim.HasAPI(UsdGeom.ModelAPI):
             mode = value.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
