@@ -124,6 +124,8 @@ def run(args: argparse.Namespace) -> int:
         say("interrupted: the table holds what was done by then")
     if not args.quiet:
         _warn_of_floor(rows, reference)
+        if args.methods is None and len(methods) < len(METHODS):
+            say("denoising is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
     print(in_words(verdict, max(row.time_limit for row in rows)), flush=True)
     title = f"{Path(args.stage).name}, {job.size[0]} x {job.size[1]}, on {device}"
     if picture is not None:
@@ -218,10 +220,8 @@ def _methods(args: argparse.Namespace) -> list[str]:
     names = list(METHODS)
     try:
         require_denoiser()
-    except InputError as error:
+    except InputError:
         names = [name for name in names if not METHODS[name].get("denoise")]
-        if not args.quiet:
-            say(f"vpl denoised is left out: {str(error).partition(': ')[2]}")
     return names
 
 
