@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         _warn_of_floor(rows, reference)
         if args.methods is None and len(methods) < len(METHODS):
-            say("denoising is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
+            say("vpl denoised is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
     print(in_words(verdict, max(row.time_limit for row in rows)), flush=True)
     title = f"{Path(args.stage).name}, {job.size[0]} x {job.size[1]}, on {device}"
     if picture is not None:
