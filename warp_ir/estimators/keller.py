@@ -72,9 +72,8 @@ def _accumulate(
                 control = int(-1)
                 if scene.control_count > 0 and k < vpls.on_lights:
                     control = vpls.control[k]
-                arrives = arriving(
-                    scene, control, position, gbuffer.mesh[pixel], True, vpls.position[k]
-                )  # V, if no more
+                # V, unless the light is shaped or linked.
+                arrives = arriving(scene, control, position, gbuffer.mesh[pixel], True, vpls.position[k])
                 irradiance = wp.cw_mul(vpls.intensity[k], arrives) * wp.min(g, bound)
                 if vpls.bounce[k] == 0:
                     from_lights += irradiance

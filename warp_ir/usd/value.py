@@ -28,13 +28,7 @@ def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats
     Raises:
         Unreadable: The value is of another type.
     """
-    value = raw(attribute, time)
-    if value is None:
-        return None
-    array = np.asarray(value)
-    if array.ndim != 2 or array.shape[1] != columns or array.dtype.kind not in "fiu":
-        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of {columns} floats each")
-    return array.astype(np.float64)
+    return _numbers(attribute, time, (columns,), f"{columns} floats each")
 
 
 def scalars(attribute: Usd.Attribute, time: Usd.TimeCode) -> Floats | None:
@@ -43,12 +37,16 @@ def scalars(attribute: Usd.Attribute, time: Usd.TimeCode) -> Floats | None:
     Raises:
         Unreadable: The value is of another type.
     """
+    return _numbers(attribute, time, (), "numbers")
+
+
+def _numbers(attribute: Usd.Attribute, time: Usd.TimeCode, row: tuple[int, ...], what: str) -> Floats | None:
     value = raw(attribute, time)
     if value is None:
         return None
     array = np.asarray(value)
-    if array.ndim != 1 or array.dtype.kind not in "fiu":
-        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of numbers")
+    if array.ndim == 0 or array.shape[1:] != row or array.dtype.kind not in "fiu":
+        raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of {what}")
     return array.astype(np.float64)
 
 
