@@ -12,7 +12,7 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
-from warp_ir.lights import lights_along
+from warp_ir.lights import lights_found
 from warp_ir.surface import albedo, closest, emission, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False})
@@ -108,7 +108,8 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         reach = hit.t
     if camera.shows_lights == 1:
         length = wp.length(ray.direction)
-        sight.emission += lights_along(scene, origin, ray.direction / length, reach * length, sight.mesh < 0, -1.0)
+        towards = ray.direction / length
+        sight.emission += lights_found(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
     return sight
 
 

@@ -507,22 +507,12 @@ def _probability(scene: SceneData, emitter: int) -> float:
 
 
 @wp.func
-def lights_along(
-    scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float
-) -> wp.vec3:
-    """Radiance of the analytic lights that a camera's ray meets before t_max; of those at infinity too if it escapes.
-
-    Lights block nothing, so all along the ray count.
-    """
-    return lights_found(scene, origin, direction, t_max, escapes, bsdf_density, -1)
-
-
-@wp.func
 def lights_found(
     scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float, mesh: int
 ) -> wp.vec3:
-    """The same for a ray that leaves a mesh (-1: the eye), and sees the lights linked to it.
+    """Radiance of the analytic lights that a ray meets before t_max; of those at infinity too if it escapes.
 
+    Lights block nothing, so all along the ray count that are linked to the mesh it leaves (-1: the eye).
     `bsdf_density` is the density per solid angle with which the direction was sampled, for weighting against
     `sample_light`; negative: no weighting.
     """

@@ -42,10 +42,6 @@ class Level:
         """world_from_level for every place, float64 [total, 4, 4]."""
         return combined(level.matrices for level in self.chain())
 
-    def colors_in_world(self) -> Floats | None:
-        """Colour (displayColor) for every place, float64 [total, 3]: the innermost level's that has any."""
-        return combined_colors((len(level.matrices), level.colors) for level in self.chain())
-
 
 def combined(matrices: Iterable[Floats]) -> Floats:
     """Places [k, 4, 4] within places, outermost first: the product over all of them, the innermost running fastest."""
