@@ -1,0 +1,22 @@
+"""The scene on a device: `upload_scene` puts it there, kernels see it as `SceneData`.
+
+`upload.py` is the whole on one page; `records.py` says what is there.
+"""
+
+from warp_ir.device_scene.camera import CameraData, camera_data
+from warp_ir.device_scene.frame import DeviceFrame
+from warp_ir.device_scene.records import _TRIANGLE_EMITTER, INSTANCE_COLOR, Patterns, SceneData
+from warp_ir.device_scene.upload import DeviceScene, upload_moments, upload_scene
+
+__all__ = [
+    "INSTANCE_COLOR",
+    "_TRIANGLE_EMITTER",
+    "CameraData",
+    "DeviceFrame",
+    "DeviceScene",
+    "Patterns",
+    "SceneData",
+    "camera_data",
+    "upload_moments",
+    "upload_scene",
+]

@@ -1,0 +1,78 @@
+"""The camera as the kernels see it."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_ir.device_scene.frame import DeviceFrame
+from warp_ir.scene import Camera, InputError, Projection
+from warp_ir.settings import RenderSettings
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class CameraData:
+    """A camera in the scene's device frame, and the image it fills."""
+
+    columns: int  # of the film: the whole image, or the data window in it
+    rows: int
+    first_column: int  # of the film in the image
+    first_row: int
+    image_columns: int
+    image_rows: int
+    shows_lights: int  # 1: analytic lights are visible
+    origin: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    back: wp.vec3
+    left: float
+    bottom: float
+    width: float
+    height: float
+    near: float
+    far: float
+    orthographic: int
+    lens_radius: float  # 0: a pinhole
+    focus: float  # depth of the plane that is sharp
+    blurs: int  # 1: the rays of a pixel differ in more than where they cross it
+
+
+def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> Any:
+    """The `CameraData` of a camera fitted to the image that the settings describe; their height must be set.
+
+    Raises:
+        InputError: The window is empty, or something is not finite.
+    """
+    assert settings.height is not None
+    if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.window).all()):
+        raise InputError(f"camera {camera.name!r}: transform and window must be finite")
+    left, right, bottom, top = camera.window
+    if not (right > left and top > bottom):
+        raise InputError(f"camera {camera.name!r}: the window is empty")
+    perspective = camera.projection == Projection.PERSPECTIVE
+    lens = camera.lens_radius if perspective and settings.depth_of_field else 0.0
+    if not (0.0 <= lens < np.inf and (lens == 0.0 or 0.0 < camera.focus_distance < np.inf)):
+        raise InputError(f"camera {camera.name!r}: lens_radius and focus_distance must be finite and not negative")
+    fitted = camera.fit(settings.width, settings.height, settings.conform, settings.pixel_aspect)
+    left, right, bottom, top = fitted.window
+    unit = 1.0 if perspective else frame.scale
+    out = CameraData()
+    out.first_column, out.first_row, out.columns, out.rows = settings.pixels()
+    out.image_columns, out.image_rows = settings.width, settings.height
+    out.shows_lights = int(settings.visible_lights)
+    with np.errstate(over="ignore"):
+        origin = frame.to_device(camera.world_from_camera[:3, 3])
+    if not np.isfinite(origin).all():
+        raise InputError(f"camera {camera.name!r}: it is too far from the scene")
+    out.origin = wp.vec3(*origin)
+    out.right, out.up, out.back = (wp.vec3(*camera.world_from_camera[:3, k]) for k in range(3))
+    out.left, out.bottom = left * unit, bottom * unit
+    out.width, out.height = (right - left) * unit, (top - bottom) * unit
+    out.near = camera.clipping[0] * frame.scale
+    out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
+    out.orthographic = int(not perspective)
+    out.lens_radius, out.focus = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
+    out.blurs = int(lens > 0.0)
+    return out

@@ -1,0 +1,128 @@
+"""What a scene must be before the device sees it."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from warp_ir.device_scene.storage import glowing_meshes
+from warp_ir.launch import Launcher
+from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene
+
+MAX_TRIANGLES = 200_000_000
+"""Above this a scene is refused before anything is allocated."""
+_BYTES_PER_TRIANGLE = 200
+_BYTES_PER_INSTANCE = 400
+
+
+def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
+    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here, but meshes `checked` before."""
+    for mesh in scene.meshes:
+        if id(mesh) not in checked:
+            _check_mesh(mesh)
+        if len(mesh.triangles) and not 0 <= mesh.material.min() <= mesh.material.max() < len(scene.materials):
+            raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
+    _check_instances(scene)
+    glowing = glowing_meshes(scene)
+    written = [(g, k) for g in scene.instances for k in g.meshes if k in glowing]
+    again = [(len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in written]
+    triangles, instances = scene.triangle_count + sum(again), sum(len(g.matrices) for g in scene.instances)
+    if triangles > MAX_TRIANGLES:
+        copies = f", {sum(again)} of them copies of instances that emit" if again else ""
+        raise InputError(f"scene: {triangles} triangles{copies}; the limit is {MAX_TRIANGLES}")
+    needed = _BYTES_PER_TRIANGLE * triangles + _BYTES_PER_INSTANCE * instances
+    if needed > launcher.memory():
+        raise InputError(
+            f"scene: {triangles} triangles and {instances} instances need about {needed / 2**30:.1f} GiB,"
+            f" {launcher.device} has {launcher.memory() / 2**30:.1f}"
+        )
+    for material in scene.materials:
+        _check_material(material)
+        if not all(0.0 <= a <= 1.0 for a in material.albedo):
+            raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
+        if not all(0.0 <= e < np.inf for e in material.emission):
+            raise InputError(f"{material.name}: emission must be finite and not negative, is {material.emission}")
+    for light in scene.lights:
+        if not all(0.0 <= e < np.inf for e in light.radiance):
+            raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
+        if light.world_from_light.shape != (4, 4) or not np.isfinite(light.world_from_light).all():
+            raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
+        texture = light.texture
+        if texture is not None:
+            if light.kind not in (LightKind.RECT, LightKind.DOME):
+                raise InputError(f"{light.name}: only RECT and DOME lights take a texture")
+            if texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
+                raise InputError(f"{light.name}: texture must have shape [h, w, 3]")
+            if not (np.isfinite(texture).all() and texture.min() >= 0.0):
+                raise InputError(f"{light.name}: texture must be finite and not negative")
+
+
+def _check_material(material: Material) -> None:
+    def demand(good: Any, what: str) -> None:
+        if not good:
+            raise InputError(f"{material.name}: {what}")
+
+    demand(0.0 <= material.opacity <= 1.0 and 0.0 <= material.cutoff <= 1.0, "opacity and cutoff must lie in [0, 1]")
+    for texture in material.textures:
+        pixels = texture.pixels
+        shaped = pixels.ndim == 3 and min(pixels.shape) >= 1 and pixels.shape[2] in (1, 3)
+        demand(shaped, f"texture {texture.name}: pixels must have shape [h, w, 3] or [h, w, 1]")
+        demand(
+            np.isfinite(pixels).all() and pixels.min() >= 0.0, f"texture {texture.name}: pixels must be finite, >= 0"
+        )
+        placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
+        demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
+        demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")
+    for bounded in (material.albedo_texture, material.opacity_texture):
+        if bounded is not None:
+            top = max(bounded.pixels.max(), *bounded.outside)
+            demand(top <= 1.0 and min(bounded.outside) >= 0.0, f"texture {bounded.name}: values must lie in [0, 1]")
+
+
+def _check_instances(scene: Scene) -> None:
+    taken: set[int] = set()
+    for group in scene.instances:
+        count = len(group.matrices)
+
+        def demand(good: Any, what: str, name: str = group.name) -> None:
+            if not good:
+                raise InputError(f"{name}: {what}")
+
+        demand(all(0 <= k < len(scene.meshes) for k in group.meshes), f"meshes outside 0..{len(scene.meshes) - 1}")
+        demand(len({*group.meshes} - taken) == len(group.meshes), "a mesh is instanced twice")
+        taken.update(group.meshes)
+        demand(group.matrices.shape == (count, 4, 4) and count > 0, "matrices must have shape [k, 4, 4], k > 0")
+        demand(np.isfinite(group.matrices).all(), "matrices must be finite")
+        demand((group.matrices[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(), "matrices must be affine")
+        if group.colors is not None:
+            demand(group.colors.shape == (count, 3), "colors must have shape [k, 3], one per instance")
+            demand(group.colors.min() >= 0.0 and group.colors.max() <= 1.0, "colors must lie in [0, 1]")
+
+
+def _check_mesh(mesh: Mesh) -> None:
+    count = len(mesh.triangles)
+
+    def demand(good: Any, what: str) -> None:
+        if not good:
+            raise InputError(f"{mesh.name}: {what}")
+
+    demand(mesh.points.ndim == 2 and mesh.points.shape[1] == 3, "points must have shape [n, 3]")
+    demand(mesh.triangles.shape == (count, 3), "triangles must have shape [m, 3]")
+    demand(mesh.material.shape == (count,), "material must have shape [m], one index per triangle")
+    if count:
+        demand(
+            mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.points),
+            f"triangles refer to points outside 0..{len(mesh.points) - 1}",
+        )
+        demand(np.isfinite(mesh.points[mesh.triangles]).all(), "points must be finite")
+    for name, corners in (("normals", mesh.normals), ("colors", mesh.colors)):
+        if corners is not None:
+            demand(corners.shape == (count, 3, 3), f"{name} must have shape [m, 3, 3]")
+            demand(np.isfinite(corners).all(), f"{name} must be finite")
+    for name, corners in mesh.uvs.items():
+        demand(corners.shape == (count, 3, 2), f"uvs {name!r} must have shape [m, 3, 2]")
+        demand(np.isfinite(corners).all(), f"uvs {name!r} must be finite")
+    if mesh.bare is not None:
+        demand(mesh.bare.shape == (count,) and mesh.bare.dtype == bool, "bare must have shape [m] and be of bools")
+    if mesh.colors is not None and count:
+        demand(mesh.colors.min() >= 0.0 and mesh.colors.max() <= 1.0, "colors must lie in [0, 1]")
