@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 LEVELS = 5
 """Passes; their taps lie 1, 2, 4, ... pixels apart."""
-_SIGMA = 5.0
+_SIGMA = 7.0
 """Standard errors by which two estimates of one value may well differ, in the first pass ..."""
 _NARROW = 0.4
 """... and its factor from pass to pass: what is left then is smooth, and differences farther apart are real."""
@@ -140,11 +140,11 @@ def new_layer(pixels: int, launcher: Launcher) -> Any:
     return layer
 
 
-def filter_layer(surfaces: Any, layer: Any, launcher: Launcher) -> Any:
-    """The filtered `Layer`; the given one is used up."""
+def filter_layer(surfaces: Any, layer: Any, launcher: Launcher) -> tuple[Any, Any]:
+    """The filtered `Layer`, and one to be overwritten; the given one is used up."""
     pixels = surfaces.columns * surfaces.rows
     other = new_layer(pixels, launcher)
     for level in range(LEVELS):
         launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level, _SIGMA * _NARROW**level])
         layer, other = other, layer
-    return layer
+    return layer, other

@@ -113,21 +113,32 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
     return sight
 
 
+@wp.func
+def _jitter_scramble(camera: CameraData, pixel: int, seed: wp.uint32) -> wp.uint32:
+    stream = sampling.hash_combine(seed, wp.uint32(image_pixel(camera, pixel)))
+    return sampling.hash_combine(stream, _JITTER)
+
+
+@wp.func
+def jitter(scene: SceneData, camera: CameraData, pixel: int, iteration: int, seed: wp.uint32) -> wp.vec2:
+    """Where in a pixel an iteration looks, in [0, 1)²."""
+    return sampling.sample_2d(scene.sobol, iteration, 0, _jitter_scramble(camera, pixel, seed))
+
+
 @wp.kernel
 def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
 ) -> None:
     """One camera ray and what it meets."""
     pixel = first + wp.tid()
-    jitter = wp.vec2(0.5, 0.5)
+    place = wp.vec2(0.5, 0.5)
     lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
-        stream = sampling.hash_combine(seed, wp.uint32(image_pixel(camera, pixel)))
-        scramble = sampling.hash_combine(stream, _JITTER)
-        jitter = sampling.sample_2d(scene.sobol, iteration, 0, scramble)
+        place = jitter(scene, camera, pixel, iteration, seed)
         if camera.lens_radius > 0.0:
+            scramble = _jitter_scramble(camera, pixel, seed)
             lens = sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, scramble))
-    sight = see(scene, camera, camera_ray(camera, pixel, jitter, lens))
+    sight = see(scene, camera, camera_ray(camera, pixel, place, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
     gbuffer.normal[pixel] = sight.normal

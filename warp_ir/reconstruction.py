@@ -7,8 +7,8 @@ found by many cheap camera rays, each taking the irradiance of the neighbouring 
 Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Then only the pixels that have
 met nothing but the surface in their centre are filtered; the others keep their plain mean.
 
-Where the result differs from the plain mean by more than the noise explains, the mean is believed: the bias vanishes
-with the noise.
+Where that leaves the plain mean by more than the noise explains, the mean is believed: the bias vanishes with the
+noise. On edges a part of the difference is given back, as much of it as is not noise (James and Stein 1961).
 """
 
 from typing import Any
@@ -17,11 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film import FilmData
 from warp_ir.filter import Layer, Surfaces, filter_layer, mean_channel, new_layer, same_surface
-from warp_ir.gbuffer import GBuffer, Sight, camera_ray, image_pixel, see, trace_primary
+from warp_ir.gbuffer import GBuffer, Sight, camera_ray, jitter, see, trace_primary
 from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False})
@@ -31,8 +30,9 @@ _EDGE_RAYS = (16, 256)
 _PROBES = wp.constant(8)  # of them, to see whether the edge is in the pixel
 _PRIOR = wp.constant(8.0)  # samples of its own that outweigh what the neighbours say about a pixel's noise
 _MATCH = wp.constant(0.2)  # of `same_surface`: below, a sample is not of that surface
-_TRUST = wp.constant(3.0)  # standard errors by which the result may differ from the mean
-_EDGE_JITTER = wp.constant(wp.uint32(0xBB67AE85))
+_AROUND = wp.constant(4.0)  # samples of its own that outweigh what the neighbours say about a pixel's brightness
+_TRUST = wp.constant(8.0)  # standard errors by which the result may differ from the mean, away from edges
+_WINDOW = wp.constant(2)  # pixels to each side that tell how much of a difference is noise
 
 
 @wp.struct
@@ -44,9 +44,21 @@ class Observations:
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the two mean channels
     count: wp.array[wp.int32]
+    noise: wp.array[wp.vec2]  # variance of one sample of the two mean channels; worked out when the picture is made
     other_direct: wp.array[wp.vec3]  # on surfaces that neither the pixel's centre shows nor a neighbour's
     other_indirect: wp.array[wp.vec3]
     other_count: wp.array[wp.int32]
+    seed: wp.uint32  # of the film
+
+
+@wp.struct
+class Picture:
+    """What becomes of it all: radiance by way of lights and of surfaces [2, pixels], and what it lacks on edges."""
+
+    radiance: wp.array2d[wp.vec3]
+    rest: Layer  # plain mean less picture, and the variance of that by noise; -1: not on an edge
+    iterations: int
+    edge_rays: int
 
 
 @wp.kernel
@@ -102,11 +114,15 @@ def _observe(
 
 @wp.kernel
 def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> None:
-    """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours."""
+    """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours.
+
+    Of a few rays to many VPLs some arrive: the variance goes with the brightness, so that of the neighbours is scaled.
+    """
     p = first + wp.tid()
     row = p // surfaces.columns
     column = p - row * surfaces.columns
     spread = wp.vec2(0.0)
+    around = wp.vec2(0.0)
     weights = float(0.0)
     for dy in range(-2, 3):
         for dx in range(-2, 3):
@@ -116,8 +132,10 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
                 q = y * surfaces.columns + x
                 if seen.count[q] > 1:
                     w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
+                    w_free = w * float(seen.count[q] - 1)
                     spread += w * _spread(seen, q)
-                    weights += w * float(seen.count[q] - 1)
+                    around += w_free / float(seen.count[q]) * _means(seen.direct[q], seen.indirect[q])
+                    weights += w_free
     n = float(seen.count[p])
     out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
@@ -125,20 +143,27 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
         direct = seen.direct[p] / n
         indirect = seen.indirect[p] / n
         # Alone on its surface: as uncertain as it is bright.
-        single = wp.vec2(mean_channel(direct), mean_channel(indirect))
-        variance = wp.cw_mul(single, single)
+        own = _means(direct, indirect)
+        variance = wp.cw_mul(own, own)
         if weights > 1.0e-6:
-            variance = (_PRIOR * spread / weights + _spread(seen, p)) / (_PRIOR + n - 1.0)
+            around = around / weights + wp.vec2(1.0e-30)
+            scale = wp.cw_div(n * own + _AROUND * around, (n + _AROUND) * around)
+            variance = (_PRIOR * wp.cw_mul(scale, spread / weights) + _spread(seen, p)) / (_PRIOR + n - 1.0)
+        seen.noise[p] = variance
         out.direct[p] = wp.vec4(direct[0], direct[1], direct[2], variance[0] / n)
         out.indirect[p] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1] / n)
 
 
 @wp.func
+def _means(direct: wp.vec3, indirect: wp.vec3) -> wp.vec2:
+    return wp.vec2(mean_channel(direct), mean_channel(indirect))
+
+
+@wp.func
 def _spread(seen: Observations, q: int) -> wp.vec2:
     """Sums of the squared deviations from the means."""
-    d = mean_channel(seen.direct[q])
-    i = mean_channel(seen.indirect[q])
-    return wp.max(seen.squares[q] - wp.vec2(d * d, i * i) / float(seen.count[q]), wp.vec2(0.0))
+    sums = _means(seen.direct[q], seen.indirect[q])
+    return wp.max(seen.squares[q] - wp.cw_mul(sums, sums) / float(seen.count[q]), wp.vec2(0.0))
 
 
 @wp.kernel
@@ -153,10 +178,11 @@ def _leave_out(first: int, seen: Observations, iterations: int, layer: Layer) ->
 
 @wp.struct
 class _Lit:
-    """Irradiance over π, in two parts, and how much is known of it."""
+    """Irradiance over π in two parts, and the variance of a sample of them, all times the weight."""
 
     direct: wp.vec3
     indirect: wp.vec3
+    noise: wp.vec2
     weight: float
 
 
@@ -166,27 +192,29 @@ def _color(v: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-def _add_neighbor(surfaces: Surfaces, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: _Lit) -> _Lit:
+def _add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: _Lit) -> _Lit:
     """Adds the irradiance of pixel `q`, if it shows the surface of a point seen `away` from its centre [pixels]."""
     out = lit
     direct = layer.direct[q]
     if direct[3] >= 0.0:
-        fit = same_surface(surfaces, q, point.position, point.shading_normal)
+        fit = same_surface(seen.surfaces, q, point.position, point.shading_normal)
         if fit > _MATCH:
             w = fit / (0.25 + wp.dot(away, away))
             out.direct += w * _color(direct)
             out.indirect += w * _color(layer.indirect[q])
+            out.noise += w * seen.noise[q]
             out.weight += w
     return out
 
 
 @wp.func
-def _interpolate(surfaces: Surfaces, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> _Lit:
+def _interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> _Lit:
     """Irradiance at a point seen through (u, v) of a pixel: from the four pixels around that show its surface.
 
     Or from any of the nine, if none of the four does.
     """
     lit = _Lit()
+    surfaces = seen.surfaces
     nearest_x = wp.where(u[0] < 0.5, -1, 1)
     nearest_y = wp.where(u[1] < 0.5, -1, 1)
     for ring in range(2):
@@ -199,31 +227,8 @@ def _interpolate(surfaces: Surfaces, layer: Layer, row: int, column: int, u: wp.
                     inside = x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows
                     if inside and near == (ring == 0):
                         away = wp.vec2(u[0] - 0.5 - float(dx), u[1] - 0.5 - float(dy))
-                        lit = _add_neighbor(surfaces, layer, y * surfaces.columns + x, away, point, lit)
+                        lit = _add_neighbor(seen, layer, y * surfaces.columns + x, away, point, lit)
     return lit
-
-
-@wp.func
-def _uncertainty(surfaces: Surfaces, film: FilmData, p: int, share: float) -> float:
-    """Variance of the film's mean at a pixel, averaged over its neighbours: that of few iterations is itself noise."""
-    if share == 1.0:
-        return 1.0e30  # one iteration says nothing about its error
-    n = 1.0 / share
-    total = float(0.0)
-    weights = float(0.0)
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            x = p % surfaces.columns + dx
-            y = p // surfaces.columns + dy
-            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                q = y * surfaces.columns + x
-                w = wp.where(dx == 0 and dy == 0, n + 2.0, 1.0)
-                for c in range(3):
-                    mean = (film.emission[q][c] + film.direct[q][c] + film.indirect[q][c]) * wp.float64(share)
-                    spread = film.squares[q][c] * wp.float64(share) - mean * mean
-                    total += w * wp.max(float(spread), 0.0) * (1.0 / 3.0)
-                weights += w
-    return total / weights * share / (1.0 - share)
 
 
 @wp.func
@@ -255,23 +260,28 @@ class _Pixel:
     direct: wp.vec3
     indirect: wp.vec3
     rays: int
+    own_direct: wp.vec3  # the same by the film's own rays alone
+    own_indirect: wp.vec3
+    own_noise: wp.vec2  # variance that light gives one of these
 
 
 @wp.func
 def _look_closely(
-    scene: SceneData, camera: CameraData, seen: Observations, layer: Layer, p: int, own: _Lit, most: int
+    scene: SceneData, camera: CameraData, seen: Observations, layer: Layer, p: int, other: _Lit, rays: wp.vec2i
 ) -> _Pixel:
-    """Sends rays through a pixel on an edge; `own` is the irradiance of what no pixel shows."""
+    """Sends rays through a pixel on an edge: as many as `rays` says, the first of which are those of the film.
+
+    `other` is the irradiance of what no pixel shows.
+    """
     surfaces = seen.surfaces
     row = p // camera.columns
     column = p - row * camera.columns
-    scramble = sampling.hash_combine(wp.uint32(image_pixel(camera, p)), _EDGE_JITTER)
     first_albedo = wp.vec3(0.0)
     first_emission = wp.vec3(0.0)
     mixed = bool(False)
     out = _Pixel()
-    while out.rays < most and (mixed or out.rays < _PROBES):
-        u = sampling.sample_2d(scene.sobol, out.rays, 0, scramble)
+    while out.rays < rays[1] and (mixed or out.rays < _PROBES):
+        u = jitter(scene, camera, p, out.rays, seen.seed)
         point = see(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
         if out.rays == 0:
             first_albedo = point.albedo
@@ -283,20 +293,40 @@ def _look_closely(
         out.rays += 1
         out.emission += point.emission
         if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
-            lit = _interpolate(surfaces, layer, row, column, u, point)
+            lit = _interpolate(seen, layer, row, column, u, point)
             if lit.weight == 0.0:
-                lit = own
+                lit = other
             out.direct += wp.cw_mul(point.albedo, lit.direct) / lit.weight
             out.indirect += wp.cw_mul(point.albedo, lit.indirect) / lit.weight
+            reflected = mean_channel(point.albedo)
+            out.own_noise += reflected * reflected * lit.noise / lit.weight
+        if out.rays <= rays[0]:
+            out.own_direct = out.direct / float(out.rays)
+            out.own_indirect = out.indirect / float(out.rays)
     out.emission = out.emission / float(out.rays)
     out.direct = out.direct / float(out.rays)
     out.indirect = out.indirect / float(out.rays)
+    out.own_noise = out.own_noise / float(out.rays)
     return out
 
 
 @wp.func
 def _single(v: wp.vec3d) -> wp.vec3:
     return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
+@wp.func
+def _student(n: float) -> float:
+    """What noise makes of (difference / standard error)² on average, the error being estimated from n samples."""
+    return wp.where(n > 3.5, (n - 1.0) / wp.max(n - 3.0, 1.0), 1.0e30)
+
+
+@wp.func
+def _give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
+    """What is to be believed of a difference between the plain mean and the result, by itself."""
+    d = mean_channel(difference)
+    ratio = _TRUST * _TRUST * _student(n) * variance / (d * d + 1.0e-30)
+    return difference / (1.0 + ratio * ratio)
 
 
 @wp.kernel
@@ -307,56 +337,93 @@ def _compose(
     seen: Observations,
     layer: Layer,
     film: FilmData,
-    weight: wp.vec3,
-    out: wp.array2d[wp.vec3],
+    exposure: float,
+    out: Picture,
 ) -> None:
-    """Radiance of a pixel from irradiance on surfaces; `weight` is (1 / iterations, exposure, edge rays)."""
+    """Radiance of a pixel from irradiance on surfaces; on edges, how far the plain mean of the same rays is off."""
     p = first + wp.tid()
     surfaces = seen.surfaces
-    share = weight[0]
-    exposure = weight[1]
-    emitted = _single(film.emission[p]) * share
-    raw_direct = _single(film.direct[p]) * share
-    raw_indirect = _single(film.indirect[p]) * share
-    albedo = film.albedo[p] * share
+    n = float(out.iterations)
+    emitted = _single(film.emission[p]) / n
+    raw_direct = _single(film.direct[p]) / n
+    raw_indirect = _single(film.indirect[p]) / n
+    albedo = film.albedo[p] / n
+    out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     direct = raw_direct
     indirect = raw_indirect
     if camera.blurs == 0 and _on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
-        own = _Lit()
-        own.weight = float(seen.other_count[p])
-        own.direct = seen.other_direct[p]
-        own.indirect = seen.other_indirect[p]
+        other = _Lit()
+        other.weight = float(seen.other_count[p])
+        other.direct = seen.other_direct[p]
+        other.indirect = seen.other_indirect[p]
         if seen.other_count[p] == 0:
-            own.weight = exposure
-            own.direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
-            own.indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
-        pixel = _look_closely(scene, camera, seen, layer, p, own, int(weight[2]))
+            other.weight = exposure
+            other.direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
+            other.indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
+        means = _means(other.direct, other.indirect)
+        other.noise = wp.cw_mul(means, means) / other.weight
+        pixel = _look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
+        emitted = pixel.emission * exposure
         direct = pixel.direct * exposure
         indirect = pixel.indirect * exposure
-        # The iterations have sampled the emission of this pixel too.
-        n = 1.0 / share
-        rays = float(pixel.rays)
-        emitted = (emitted * n + pixel.emission * (exposure * rays)) / (n + rays)
+        if surfaces.footprint[p] > 0.0:
+            more = raw_direct - pixel.own_direct * exposure
+            noise = pixel.own_noise * (exposure * exposure / n)
+            out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])
+            more = raw_indirect - pixel.own_indirect * exposure
+            out.rest.indirect[p] = wp.vec4(more[0], more[1], more[2], noise[1])
     elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
         direct = wp.cw_mul(albedo, _color(layer.direct[p])) * exposure
         indirect = wp.cw_mul(albedo, _color(layer.indirect[p])) * exposure
-    if surfaces.footprint[p] > 0.0:
-        # Nothing is believed that the plain mean contradicts.
-        difference = mean_channel(direct + indirect - raw_direct - raw_indirect)
-        squared = difference * difference / (_TRUST * _TRUST * _uncertainty(surfaces, film, p, share) + 1.0e-30)
-        trust = 1.0 / (1.0 + squared * squared)
-        direct = raw_direct + (direct - raw_direct) * trust
-        indirect = raw_indirect + (indirect - raw_indirect) * trust
-    out[0, p] = direct + emitted
-    out[1, p] = indirect
+        reflected = mean_channel(albedo) * exposure
+        noise = seen.noise[p] * (reflected * reflected / n)
+        direct += _give_back(raw_direct - direct, noise[0], n)
+        indirect += _give_back(raw_indirect - indirect, noise[1], n)
+    out.radiance[0, p] = direct + emitted
+    out.radiance[1, p] = indirect
+
+
+@wp.kernel
+def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
+    """Gives back to pixels on edges what is not noise in their difference to the plain mean.
+
+    That of a few pixels together is known best: if noise alone made the differences, their squares would be as large
+    as their variances on average; of squares that are r times as large, the share 1 - 1/r is real.
+    """
+    p = first + wp.tid()
+    if out.rest.direct[p][3] >= 0.0:
+        ratio = wp.vec2(0.0)
+        weights = float(0.0)
+        for dy in range(-_WINDOW, _WINDOW + 1):
+            for dx in range(-_WINDOW, _WINDOW + 1):
+                x = p % surfaces.columns + dx
+                y = p // surfaces.columns + dy
+                if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
+                    d = out.rest.direct[y * surfaces.columns + x]
+                    if d[3] >= 0.0:
+                        i = out.rest.indirect[y * surfaces.columns + x]
+                        means = _means(_color(d), _color(i))
+                        w = 1.0 / (1.0 + 0.5 * float(dx * dx + dy * dy))
+                        ratio += w * wp.cw_div(wp.cw_mul(means, means), wp.vec2(d[3], i[3]) + wp.vec2(1.0e-30))
+                        weights += w
+        noise = _student(float(out.iterations)) * weights
+        d = out.rest.direct[p]
+        i = out.rest.indirect[p]
+        out.radiance[0, p] = out.radiance[0, p] + _color(d) * wp.max(1.0 - noise / (ratio[0] + 1.0e-30), 0.0)
+        out.radiance[1, p] = out.radiance[1, p] + _color(i) * wp.max(1.0 - noise / (ratio[1] + 1.0e-30), 0.0)
+
+
+_NO_SUMS = ("surfaces", "noise", "seed")
 
 
 class Reconstruction:
     """Gathers what the filter needs beside the film, and makes the picture of both."""
 
-    def __init__(self, scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, exposure: float) -> None:
-        """Looks through the centre of every pixel; `gbuffer` is used as scratch."""
+    def __init__(
+        self, scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, exposure: float, seed: int
+    ) -> None:
+        """Looks through the centre of every pixel; `gbuffer` is used as scratch, `seed` is that of the film."""
         self._scene, self._camera, self._launcher, self._exposure = scene, camera, launcher, exposure
         pixels = camera.columns * camera.rows
         self._pixels = pixels
@@ -371,7 +438,8 @@ class Reconstruction:
             seen.surfaces = surfaces
             for name in ("direct", "indirect", "other_direct", "other_indirect"):
                 setattr(seen, name, launcher.zeros(pixels, wp.vec3))
-            seen.squares = launcher.zeros(pixels, wp.vec2)
+            seen.squares, seen.noise = launcher.zeros(pixels, wp.vec2), launcher.zeros(pixels, wp.vec2)
+            seen.seed = wp.uint32(seed)
             seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
             self._seen = seen
 
@@ -381,7 +449,7 @@ class Reconstruction:
 
     def arrays(self) -> dict[str, Any]:
         """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""
-        return {name: getattr(self._seen, name) for name in Observations.vars if name != "surfaces"}
+        return {name: getattr(self._seen, name) for name in Observations.vars if name not in _NO_SUMS}
 
     def merge(self, other: "Reconstruction") -> None:
         """Adds another's samples."""
@@ -399,12 +467,15 @@ class Reconstruction:
                 seen.surfaces = _copy(Surfaces, seen.surfaces)
                 seen.surfaces.footprint = wp.clone(seen.surfaces.footprint)
                 launcher.launch(_leave_out, pixels, [seen, iterations, layer])
-            layer = filter_layer(seen.surfaces, layer, launcher)
-            out = launcher.empty((2, pixels), wp.vec3)
-            rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
-            weight = wp.vec3(1.0 / iterations, self._exposure, float(rays))
-            launcher.launch(_compose, pixels, [self._scene.data, self._camera, seen, layer, film, weight, out])
-            return np.asarray(out.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
+            layer, scratch = filter_layer(seen.surfaces, layer, launcher)
+            out = Picture()
+            out.radiance, out.rest = launcher.empty((2, pixels), wp.vec3), scratch
+            out.iterations = iterations
+            out.edge_rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
+            inputs = [self._scene.data, self._camera, seen, layer, film, self._exposure, out]
+            launcher.launch(_compose, pixels, inputs)
+            launcher.launch(_correct_edges, pixels, [seen.surfaces, out])
+            return np.asarray(out.radiance.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
 
 
 def _copy(kind: Any, record: Any) -> Any:

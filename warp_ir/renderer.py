@@ -142,7 +142,7 @@ class Renderer:
         film.settings = self.settings
         if self.settings.filter and self.settings.estimator == "vpl" and not self.settings.denoise:
             film.reconstruction = Reconstruction(
-                first.scene, first.camera, self.launcher, self._gbuffer, first.exposure
+                first.scene, first.camera, self.launcher, self._gbuffer, first.exposure, self.settings.seed
             )
         return film
 
