@@ -1,6 +1,7 @@
 """Intel Open Image Denoise, for those who want a smoother picture than the variance-guided filter gives.
 
-Optional: ``pip install 'warp-ir[denoise]'``. It works on the plain mean, with the albedo and normals that the film has
+Optional: ``pip install 'warp-ir[denoise]'``. The picture is the mean of what it makes and of what our filter makes:
+their errors are hardly related. It works on the plain mean, with the albedo and normals that the film has
 gathered beside it. It is biased in ways that nobody can state, which is why it is off unless asked for.
 """
 

@@ -351,7 +351,8 @@ def _compose(
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     direct = raw_direct
     indirect = raw_indirect
-    if camera.blurs == 0 and _on_edge(surfaces, film, p):
+    on_edge = seen.count[p] != out.iterations or _on_edge(surfaces, film, p)
+    if camera.blurs == 0 and on_edge:
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
         other = _Lit()
         other.weight = float(seen.other_count[p])
@@ -364,7 +365,8 @@ def _compose(
         means = _means(other.direct, other.indirect)
         other.noise = wp.cw_mul(means, means) / other.weight
         pixel = _look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
-        emitted = pixel.emission * exposure
+        if pixel.rays > out.iterations:
+            emitted = pixel.emission * exposure
         direct = pixel.direct * exposure
         indirect = pixel.indirect * exposure
         if surfaces.footprint[p] > 0.0:

@@ -140,7 +140,7 @@ class Renderer:
         first = self._moments[0]
         film = Film(first.camera.columns, first.camera.rows, self.launcher, first.scene.frame)
         film.settings = self.settings
-        if self.settings.filter and self.settings.estimator == "vpl" and not self.settings.denoise:
+        if self.settings.filter and self.settings.estimator == "vpl":
             film.reconstruction = Reconstruction(
                 first.scene, first.camera, self.launcher, self._gbuffer, first.exposure, self.settings.seed
             )

@@ -61,7 +61,7 @@ class RenderSettings:
         " darkens corners; 0 = unbounded",
     )
     filter: bool = _setting(True, "vpl only: filter the noise that is left; off, the picture is the unbiased mean")
-    denoise: bool = _setting(False, "denoise the mean by Open Image Denoise (extra 'denoise') instead of filtering it")
+    denoise: bool = _setting(False, "average the filtered picture with one by Open Image Denoise (extra 'denoise')")
     visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
     seed: int = _setting(0, "seed of the random scrambling; the same seed gives the same bits")
 

@@ -92,6 +92,15 @@ def test_denoise_needs_its_extra(monkeypatch):
         ir.render(cornell_box(), ir.RenderSettings(width=8, height=8, iterations=2, denoise=True))
 
 
+def test_denoised_and_filtered(device):
+    """Denoised and filtered is the mean of both."""
+    pytest.importorskip("pyoidn")
+    how = [{"filter": True}, {"denoise": True, "filter": False}, {"denoise": True, "filter": True}]
+    one, other, both = (render(cornell_box(), "vpl", device, iterations=4, **flags).radiance() for flags in how)
+    np.testing.assert_allclose(both, (one + other) / 2, rtol=1e-5)
+    assert np.abs(one - other).max() > 0.01
+
+
 def test_denoised_picture(truth):
     """Denoised, four iterations are better than their plain mean, below the lamp."""
     pytest.importorskip("pyoidn")
