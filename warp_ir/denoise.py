@@ -12,9 +12,6 @@ import numpy.typing as npt
 
 from warp_ir.scene import InputError
 
-_CLEAN_ITERATIONS = 8
-"""From here on albedo and normals are smoother than what the denoiser would make of them."""
-
 
 def require_denoiser() -> Any:
     """The denoiser's module.
@@ -30,15 +27,15 @@ def require_denoiser() -> Any:
 
 
 def denoise(
-    radiance: npt.NDArray[Any], albedo: npt.NDArray[Any], normal: npt.NDArray[Any], iterations: int
+    radiance: npt.NDArray[Any], albedo: npt.NDArray[Any], normal: npt.NDArray[Any], clean: bool
 ) -> npt.NDArray[np.float32]:
-    """A denoised picture, float32 [height, width, 3], of the mean of some iterations and its features, all that shape.
+    """A denoised picture, float32 [height, width, 3], of a noisy one and its features, all that shape.
+
+    `clean` says that the features have no noise: it takes their edges for true.
 
     Raises:
         InputError: The denoiser is not installed.
     """
     color, base, facing = (np.ascontiguousarray(x, np.float32) for x in (radiance, albedo, normal))
-    result = require_denoiser().denoise(
-        color, np.clip(base, 0.0, 1.0), facing, hdr=True, clean_aux=iterations >= _CLEAN_ITERATIONS
-    )
+    result = require_denoiser().denoise(color, np.clip(base, 0.0, 1.0), facing, hdr=True, clean_aux=clean)
     return np.asarray(result, np.float32)

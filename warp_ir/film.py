@@ -24,6 +24,8 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 """What `Film.aov` can give beside the radiance."""
 Image = npt.NDArray[Any]
 _RADIANCE = ("emission", "direct", "indirect")
+_CLEAN_ITERATIONS = 8
+"""From here on albedo and normals are smoother than what a denoiser would make of them."""
 _SEEN = "seen_"
 """What the names of the filter's arrays begin with in a file."""
 
@@ -160,7 +162,7 @@ class Film:
         """
         pictures = []
         if self.reconstruction is not None and self.iterations > 0:
-            direct, indirect = self._reconstruct()
+            direct, indirect = self._reconstruct()[:2]
             pictures.append(direct + indirect)
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
             pictures.append(self._denoise())
@@ -173,14 +175,20 @@ class Film:
         """The denoised mean, computed once per iteration."""
         if self._denoised[0] != self.iterations:
             with self._launcher.phase("filter"):
-                picture = denoise(self._mean(*_RADIANCE), self.aov("albedo"), self.aov("normal"), self.iterations)
+                if self.reconstruction is not None:
+                    albedo, normal = self._reconstruct()[2:]
+                else:
+                    albedo, normal = self.aov("albedo"), self.aov("normal")
+                clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
+                picture = denoise(self._mean(*_RADIANCE), albedo, normal, clean)
             self._denoised = (self.iterations, picture)
         return np.asarray(self._denoised[1])
 
     def _reconstruct(self) -> npt.NDArray[np.float32]:
-        """Filtered direct and indirect radiance [2, height, width, 3], computed once per iteration."""
+        """What `Reconstruction.resolve` makes of the film, computed once per iteration."""
         if self._resolved[0] != self.iterations:
-            self._resolved = (self.iterations, self.reconstruction.resolve(self._data, self.iterations))
+            features = self.settings is not None and self.settings.denoise
+            self._resolved = (self.iterations, self.reconstruction.resolve(self._data, self.iterations, features))
         return np.asarray(self._resolved[1])
 
     def standard_error(self) -> npt.NDArray[np.float32]:

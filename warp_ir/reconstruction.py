@@ -53,9 +53,9 @@ class Observations:
 
 @wp.struct
 class Picture:
-    """What becomes of it all: radiance by way of lights and of surfaces [2, pixels], and what it lacks on edges."""
+    """What becomes of it all, and what it lacks on edges."""
 
-    radiance: wp.array2d[wp.vec3]
+    rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; albedo and normal, if there are four
     rest: Layer  # plain mean less picture, and the variance of that by noise; -1: not on an edge
     iterations: int
     edge_rays: int
@@ -263,6 +263,8 @@ class _Pixel:
     own_direct: wp.vec3  # the same by the film's own rays alone
     own_indirect: wp.vec3
     own_noise: wp.vec2  # variance that light gives one of these
+    albedo: wp.vec3
+    normal: wp.vec3
 
 
 @wp.func
@@ -292,6 +294,8 @@ def _look_closely(
         mixed = mixed or same_surface(surfaces, p, point.position, point.shading_normal) < _MATCH
         out.rays += 1
         out.emission += point.emission
+        out.albedo += point.albedo
+        out.normal += point.shading_normal
         if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
             lit = _interpolate(seen, layer, row, column, u, point)
             if lit.weight == 0.0:
@@ -348,6 +352,7 @@ def _compose(
     raw_direct = _single(film.direct[p]) / n
     raw_indirect = _single(film.indirect[p]) / n
     albedo = film.albedo[p] / n
+    normal = film.normal[p] / n
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     direct = raw_direct
     indirect = raw_indirect
@@ -367,6 +372,8 @@ def _compose(
         pixel = _look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
         if pixel.rays > out.iterations:
             emitted = pixel.emission * exposure
+            albedo = pixel.albedo / float(pixel.rays)
+            normal = pixel.normal / float(pixel.rays)
         direct = pixel.direct * exposure
         indirect = pixel.indirect * exposure
         if surfaces.footprint[p] > 0.0:
@@ -382,8 +389,11 @@ def _compose(
         noise = seen.noise[p] * (reflected * reflected / n)
         direct += _give_back(raw_direct - direct, noise[0], n)
         indirect += _give_back(raw_indirect - indirect, noise[1], n)
-    out.radiance[0, p] = direct + emitted
-    out.radiance[1, p] = indirect
+    if out.rows.shape[0] > 2:
+        out.rows[2, p] = albedo
+        out.rows[3, p] = normal
+    out.rows[0, p] = direct + emitted
+    out.rows[1, p] = indirect
 
 
 @wp.kernel
@@ -412,8 +422,8 @@ def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
         noise = _student(float(out.iterations)) * weights
         d = out.rest.direct[p]
         i = out.rest.indirect[p]
-        out.radiance[0, p] = out.radiance[0, p] + _color(d) * wp.max(1.0 - noise / (ratio[0] + 1.0e-30), 0.0)
-        out.radiance[1, p] = out.radiance[1, p] + _color(i) * wp.max(1.0 - noise / (ratio[1] + 1.0e-30), 0.0)
+        out.rows[0, p] = out.rows[0, p] + _color(d) * wp.max(1.0 - noise / (ratio[0] + 1.0e-30), 0.0)
+        out.rows[1, p] = out.rows[1, p] + _color(i) * wp.max(1.0 - noise / (ratio[1] + 1.0e-30), 0.0)
 
 
 _NO_SUMS = ("surfaces", "noise", "seed")
@@ -458,8 +468,11 @@ class Reconstruction:
         for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())
 
-    def resolve(self, film: Any, iterations: int) -> npt.NDArray[np.float32]:
-        """Radiance by way of lights and of surfaces, float32 [2, rows, columns, 3], from a `FilmData`."""
+    def resolve(self, film: Any, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
+        """Radiance by way of lights and of surfaces, from a `FilmData`: float32 [2, rows, columns, 3].
+
+        With `features` [4, ...]: albedo and normals, their edges as smooth as those of the picture, come after it.
+        """
         launcher, pixels = self._launcher, self._pixels
         with launcher.phase("filter"):
             seen, layer = self._seen, new_layer(pixels, launcher)
@@ -471,13 +484,13 @@ class Reconstruction:
                 launcher.launch(_leave_out, pixels, [seen, iterations, layer])
             layer, scratch = filter_layer(seen.surfaces, layer, launcher)
             out = Picture()
-            out.radiance, out.rest = launcher.empty((2, pixels), wp.vec3), scratch
+            out.rows, out.rest = launcher.empty((4 if features else 2, pixels), wp.vec3), scratch
             out.iterations = iterations
             out.edge_rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             inputs = [self._scene.data, self._camera, seen, layer, film, self._exposure, out]
             launcher.launch(_compose, pixels, inputs)
             launcher.launch(_correct_edges, pixels, [seen.surfaces, out])
-            return np.asarray(out.radiance.numpy()).reshape(2, self._camera.rows, self._camera.columns, 3)
+            return np.asarray(out.rows.numpy()).reshape(-1, self._camera.rows, self._camera.columns, 3)
 
 
 def _copy(kind: Any, record: Any) -> Any:
