@@ -176,11 +176,11 @@ class Film:
         if self._denoised[0] != self.iterations:
             with self._launcher.phase("filter"):
                 if self.reconstruction is not None:
-                    albedo, normal = self._reconstruct()[2:]
+                    albedo, normal, noisy = self._reconstruct()[2:]
                 else:
-                    albedo, normal = self.aov("albedo"), self.aov("normal")
+                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._mean(*_RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
-                picture = denoise(self._mean(*_RADIANCE), albedo, normal, clean)
+                picture = denoise(noisy, albedo, normal, clean)
             self._denoised = (self.iterations, picture)
         return np.asarray(self._denoised[1])
 

@@ -353,6 +353,7 @@ def _compose(
     raw_indirect = _single(film.indirect[p]) / n
     albedo = film.albedo[p] / n
     normal = film.normal[p] / n
+    plain = emitted + raw_direct + raw_indirect
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     direct = raw_direct
     indirect = raw_indirect
@@ -371,9 +372,12 @@ def _compose(
         other.noise = wp.cw_mul(means, means) / other.weight
         pixel = _look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
         if pixel.rays > out.iterations:
-            emitted = pixel.emission * exposure
             albedo = pixel.albedo / float(pixel.rays)
             normal = pixel.normal / float(pixel.rays)
+            # The mean as it were of as many rays: less what the film's own saw, and more what all see.
+            plain += (pixel.direct - pixel.own_direct + pixel.indirect - pixel.own_indirect) * exposure
+            plain += pixel.emission * exposure - emitted
+            emitted = pixel.emission * exposure
         direct = pixel.direct * exposure
         indirect = pixel.indirect * exposure
         if surfaces.footprint[p] > 0.0:
@@ -392,6 +396,7 @@ def _compose(
     if out.rows.shape[0] > 2:
         out.rows[2, p] = albedo
         out.rows[3, p] = normal
+        out.rows[4, p] = plain
     out.rows[0, p] = direct + emitted
     out.rows[1, p] = indirect
 
@@ -484,7 +489,7 @@ class Reconstruction:
                 launcher.launch(_leave_out, pixels, [seen, iterations, layer])
             layer, scratch = filter_layer(seen.surfaces, layer, launcher)
             out = Picture()
-            out.rows, out.rest = launcher.empty((4 if features else 2, pixels), wp.vec3), scratch
+            out.rows, out.rest = launcher.empty((5 if features else 2, pixels), wp.vec3), scratch
             out.iterations = iterations
             out.edge_rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
             inputs = [self._scene.data, self._camera, seen, layer, film, self._exposure, out]
