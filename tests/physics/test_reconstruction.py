@@ -92,13 +92,15 @@ def test_denoise_needs_its_extra(monkeypatch):
         ir.render(cornell_box(), ir.RenderSettings(width=8, height=8, iterations=2, denoise=True))
 
 
-def test_denoised_and_filtered(device):
-    """Denoised and filtered is the mean of both."""
+def test_denoised_and_filtered(truth):
+    """The errors of two unlike filters are hardly related: their mean has less than either."""
     pytest.importorskip("pyoidn")
     how = [{"filter": True}, {"denoise": True, "filter": False}, {"denoise": True, "filter": True}]
-    one, other, both = (render(cornell_box(), "vpl", device, iterations=4, **flags).radiance() for flags in how)
-    np.testing.assert_allclose(both, (one + other) / 2, rtol=1e-5)
-    assert np.abs(one - other).max() > 0.01
+    errors = []
+    for flags in how:
+        film = render(cornell_box(), "vpl", width=48, height=48, iterations=4, **flags)
+        errors.append(relative_mse(film.radiance()[12:], truth[12:]))
+    assert errors[2] < 0.9 * min(errors[:2])
 
 
 def test_denoised_picture(truth):
