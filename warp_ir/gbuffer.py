@@ -12,8 +12,8 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
-from warp_ir.lights import lights_found
-from warp_ir.surface import albedo, closest, emission, shading_normal, smooth_rise
+from warp_ir.lights import lights_found, surface_seen
+from warp_ir.surface import albedo, closest, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,6 +89,8 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
     origin = ray.origin + ray.direction * camera.near
     reach = camera.far - camera.near
     hit = closest(scene, origin, ray.direction, reach)
+    length = wp.length(ray.direction)
+    towards = ray.direction / length
     sight = Sight()
     sight.mesh = -1
     if hit.triangle >= 0:
@@ -104,11 +106,9 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
         sight.albedo = albedo(scene, hit, pixel)
-        sight.emission = emission(scene, hit, pixel)
+        sight.emission = surface_seen(scene, hit, towards, pixel)
         reach = hit.t
     if camera.shows_lights == 1:
-        length = wp.length(ray.direction)
-        towards = ray.direction / length
         sight.emission += lights_found(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
     return sight
 

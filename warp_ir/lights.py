@@ -21,7 +21,7 @@ from warp_ir.grid import (
 )
 from warp_ir.light_control import linked, shaping_factor
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, closest, emitted, offset, presence, visible
+from warp_ir.surface import Hit, closest, emission, emitted, glow, has_glow, leave, offset, presence, visible
 
 wp.set_module_options({"enable_backward": False})
 
@@ -129,7 +129,9 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
     if scene.open_count > 0:
         radiance = radiance * presence(scene, triangle, at_a, at_b)
     out.intensity = radiance / out.density
-    out.control = -1
+    out.control = _control_of_surface(scene, triangle)
+    if _only_sampled(scene, out.control):
+        out.density = 0.0
     return out
 
 
@@ -147,6 +149,16 @@ def control_of(scene: SceneData, light: int) -> int:
     if scene.control_count == 0 or light < 0:
         return -1
     return scene.light_tables[0].controls.of_light[light]
+
+
+@wp.func
+def _control_of_surface(scene: SceneData, triangle: int) -> int:
+    """The row of the control of an emissive surface, or -1."""
+    if scene.control_count == 0:
+        return -1
+    if scene.light_tables[0].controls.surface_count == 0:
+        return -1
+    return scene.light_tables[0].controls.of_mesh[scene.triangle_mesh[triangle]]
 
 
 @wp.func
@@ -311,10 +323,7 @@ def _visible_past(scene: SceneData, shadowless: int, position: wp.vec3, target: 
 @wp.func
 def _behind(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
     """Where a ray goes on that passes through the surface it has hit."""
-    a = scene.points[scene.indices[3 * hit.triangle]]
-    b = scene.points[scene.indices[3 * hit.triangle + 1]]
-    c = scene.points[scene.indices[3 * hit.triangle + 2]]
-    return offset(a, b, c, hit.u, hit.v, wp.normalize(direction) - hit.normal)
+    return leave(scene, hit, wp.normalize(direction) - hit.normal)
 
 
 @wp.struct
@@ -607,7 +616,94 @@ def lights_beyond(
                 p = origin + direction * (hit[3] * 0.99999)
                 arrives = arriving(scene, control_of(scene, light), origin, mesh, seen, wp.vec4(p[0], p[1], p[2], 1.0))
                 total += wp.cw_mul(_face_radiance(scene, light, origin, direction, hit[3]), arrives) * share
+    if scene.control_count > 0:
+        if scene.light_tables[0].controls.sampled_surfaces > 0:
+            total += _sampled_surfaces_beyond(scene, origin, direction, cosine, bound, reach, mesh, seen)
     return total
+
+
+@wp.func(inline=False)
+def _sampled_surfaces_beyond(
+    scene: SceneData,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    cosine: float,
+    bound: Bound,
+    reach: float,
+    mesh: int,
+    seen: bool,
+) -> wp.vec3:
+    """The same of emissive surfaces that see other surfaces than rays do: all along the ray, whatever hides them."""
+    total = wp.vec3(0.0)
+    start = origin
+    passed = float(0.0)
+    for _ in range(_CROSSINGS):
+        hit = closest(scene, start, direction, reach - passed)
+        if hit.triangle < 0:
+            break
+        control = _control_of_surface(scene, hit.triangle)
+        if _only_sampled(scene, control):
+            radiance = emission(scene, hit, scene.footprint)
+            distance = passed + hit.t
+            share = _cut_of_surface(scene, hit, -wp.dot(hit.normal, direction) * cosine / (distance * distance), bound)
+            if share > 0.0 and wp.max(radiance) > 0.0:
+                target = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
+                total += wp.cw_mul(radiance, arriving(scene, control, origin, mesh, seen, target)) * share
+        start = _behind(scene, hit, direction)
+        passed = wp.dot(start - origin, direction)
+    return total
+
+
+@wp.func
+def _cut_of_surface(scene: SceneData, hit: Hit, g: float, bound: Bound) -> float:
+    """The share (1 - bound/G)⁺ for the place where a ray meets an emissive surface."""
+    emitter = scene.triangle_emitter[hit.triangle]
+    if emitter < 0:
+        return 0.0
+    return cut_share(bound_on(bound, scene.emitter_density[emitter]), g)
+
+
+@wp.func
+def surface_beyond(scene: SceneData, hit: Hit, direction: wp.vec3, g: float, bound: Bound, mesh: int) -> wp.vec3:
+    """What `lights_beyond` is for lights, for the surface that a unit direction from a mesh has hit; `g` is its G."""
+    radiance = emission(scene, hit, scene.footprint)
+    if wp.max(radiance) <= 0.0:
+        return radiance
+    return _towards(scene, hit, direction, radiance, mesh, 0.0) * _cut_of_surface(scene, hit, g, bound)
+
+
+@wp.func
+def _towards(
+    scene: SceneData, hit: Hit, direction: wp.vec3, radiance: wp.vec3, mesh: int, bsdf_density: float
+) -> wp.vec3:
+    """What of a surface's emission goes back along a ray from a mesh; arguments as for `lights_found`."""
+    control = _control_of_surface(scene, hit.triangle)
+    if control < 0:
+        return radiance
+    if not _may_find(scene, control, mesh, bsdf_density):
+        return wp.vec3(0.0)
+    return wp.cw_mul(radiance, _shaping(scene, control, -direction))
+
+
+@wp.func
+def surface_seen(scene: SceneData, hit: Hit, direction: wp.vec3, footprint: float) -> wp.vec3:
+    """Radiance that the camera sees of a surface which a unit direction has hit."""
+    if has_glow(scene, hit.triangle):
+        return glow(scene, hit, footprint)
+    radiance = emission(scene, hit, footprint)
+    if wp.max(radiance) <= 0.0:
+        return radiance
+    return _towards(scene, hit, direction, radiance, -1, -1.0)
+
+
+@wp.func
+def surface_found(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_density: float, mesh: int) -> wp.vec3:
+    """What `lights_found` is for lights, for the surface that a unit direction, sampled from a BSDF, has hit."""
+    radiance = emission(scene, hit, scene.footprint)
+    if wp.max(radiance) <= 0.0:
+        return radiance
+    arrives = _towards(scene, hit, direction, radiance, mesh, bsdf_density)
+    return arrives * _surface_weight(scene, hit, direction, bsdf_density)
 
 
 @wp.func
@@ -619,10 +715,8 @@ def _cut(scene: SceneData, light: int, hit: wp.vec4, direction: wp.vec3, cosine:
 
 
 @wp.func
-def surface_weight(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_density: float) -> float:
+def _surface_weight(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_density: float) -> float:
     """The weight of the emission of an emissive surface that a unit direction, sampled from a BSDF, has hit."""
-    if bsdf_density < 0.0:
-        return 1.0
     a = scene.points[scene.indices[3 * hit.triangle]]
     b = scene.points[scene.indices[3 * hit.triangle + 1]]
     c = scene.points[scene.indices[3 * hit.triangle + 2]]

@@ -16,9 +16,9 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
 from warp_ir.launch import Launcher
-from warp_ir.lights import LightPoint, arriving, lights_found, sample_light, surface_weight
+from warp_ir.lights import LightPoint, arriving, lights_found, sample_light, surface_found
 from warp_ir.settings import RenderSettings
-from warp_ir.surface import albedo, closest, emission
+from warp_ir.surface import albedo, closest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,9 +97,7 @@ def _trace_paths(
                 reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
                 seen = lights_found(scene, position, direction, reach, hit.triangle < 0, density, mesh)
                 if hit.triangle >= 0:
-                    emitted = emission(scene, hit, scene.footprint)
-                    if wp.max(emitted) > 0.0:
-                        seen += emitted * surface_weight(scene, hit, direction, density)
+                    seen += surface_found(scene, hit, direction, density, mesh)
                 found += wp.cw_mul(throughput, seen)
             if bounce == 0:
                 once += found
