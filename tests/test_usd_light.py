@@ -510,6 +510,78 @@ def test_a_mesh_light_is_an_emissive_surface(tmp_path, more, emission, albedo):
     assert scene.lights == () and not scene.meshes[0].double_sided
 
 
+def test_the_camera_sees_the_glow_of_an_independent_material(tmp_path):
+    """MaterialSyncMode = independent: the eye sees the material's emission, the scene is lit by the light's alone."""
+    more = BIND + 'uniform token light:materialSyncMode = "independent"'
+    (material,) = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials
+    assert material.glow == (1.0, 0.5, 0.0) and material.emission == (12.0, 12.0, 12.0)
+    for mode in ("noMaterialResponse", "materialGlowTintsLight"):
+        more = BIND + f'uniform token light:materialSyncMode = "{mode}"'
+        assert load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials[0].glow is None
+
+
+def test_mesh_lights_have_shaping_links_and_shadows(tmp_path):
+    """ShapingAPI, ShadowAPI and the links of a surface that emits are read as those of any light, without a word."""
+    more = """bool inputs:shadow:enable = false
+    float inputs:shaping:cone:angle = 20
+    float inputs:shaping:focus = 3
+    rel collection:lightLink:excludes = [</N>]
+    rel collection:shadowLink:excludes = [</M>]
+    double3 xformOp:translate = (0, 0, 5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]"""
+    apis = 'MeshLightAPI", "ShapingAPI", "ShadowAPI'
+    scene = load(tmp_path, MESH_LIGHT % (apis, more) + 'def Sphere "N" {}\n')
+    light = scene.meshes[0].light
+    assert light.shaping.cone_angle == 20.0 and light.shaping.focus == 3.0 and not light.shadows
+    assert light.unlit == {1} and light.shadowless == {0} and scene.meshes[1].light is None
+    assert light.world_from_light[2, 3] == 5.0 and not warned(scene, "/M")
+
+
+def test_places_of_a_mesh_light_that_differ_are_told_apart(tmp_path):
+    """Every copy of a shaped light has its axis; of a normalized one its radiance, by its own area."""
+    text = """def Xform "P" {
+    def Mesh "M" (prepend apiSchemas = ["MeshLightAPI"%s]) {
+        point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]
+        int[] faceVertexCounts = [4]
+        int[] faceVertexIndices = [0, 1, 2, 3]
+        uniform token subdivisionScheme = "none"
+        float inputs:intensity = 12
+        bool inputs:normalize = true
+    }
+}
+def PointInstancer "I" {
+    rel prototypes = </P>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = [(0, 0, 0), (10, 0, 0)]
+    float3[] scales = [(1, 1, 1), %s]
+    quath[] orientations = [(1, 0, 0, 0), (0, 1, 0, 0)]
+}
+"""
+    alike = load(tmp_path, text % ("", "(1, 1, 1)"))
+    assert [len(mesh.triangles) for mesh in alike.meshes] == [2, 4]
+    scaled = load(tmp_path, text % ("", "(2, 2, 2)"))
+    emission = [scaled.materials[mesh.material[0]].emission[0] for mesh in scaled.meshes]
+    assert emission == pytest.approx([2.0, 2.0, 0.5])
+    shaped = load(tmp_path, text % (', "ShapingAPI"', "(1, 1, 1)"))
+    assert [mesh.light.world_from_light[2, 2] for mesh in shaped.meshes] == pytest.approx([1.0, 1.0, -1.0])
+
+
+def test_textures_of_mesh_lights(tmp_path):
+    """texture:file multiplies the emission and is placed by the mesh's st."""
+    pixels = np.zeros((2, 2, 3), np.float32)
+    pixels[0, 1] = (1.0, 0.5, 0.25)
+    write_exr(tmp_path / "t.exr", pixels)
+    more = """asset inputs:texture:file = @t.exr@
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")"""
+    scene = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more))
+    texture = scene.materials[0].emission_texture
+    np.testing.assert_allclose(texture.pixels, 12.0 * pixels, rtol=1e-3)
+    np.testing.assert_array_equal(scene.meshes[0].uvs[texture.uv][0], [(0, 0), (1, 0), (1, 1)])
+    assert not warned(scene, "/M")
+    scene = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", "asset inputs:texture:file = @t.exr@"))
+    assert warned(scene, "/M", "no primvar 'st'")
+
+
 def test_any_gprim_can_be_a_light(tmp_path):
     """LightAPI on a Sphere: its radius is geometry, its surface emits and answers with no material."""
     text = 'def Sphere "S" (prepend apiSchemas = ["LightAPI"]) { double radius = 2\n float inputs:intensity = 3\n}'

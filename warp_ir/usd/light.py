@@ -86,7 +86,7 @@ def read_light(
         str(prim.GetPath()),
         kind,
         as_color(radiance),
-        texture=_texture(inputs, kind),
+        texture=light_texture(inputs, kind),
         shaping=read_shaping(inputs, kind),
         shadows=not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True),
     )
@@ -173,7 +173,7 @@ class _Placing:
         )
 
 
-def _texture(inputs: Inputs, kind: LightKind) -> Floats | None:
+def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     """The image that multiplies a light's radiance, float32 [h, w, 3], as `Light` wants it."""
     asset = inputs.asset("texture:file")
     if asset is None:

@@ -260,7 +260,7 @@ class StageReader:
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
         stats["prototypes"] = len(geometry.instances)
         stats["prototype_places"] = sum(len(group.matrices) for group in geometry.instances)
-        lights = link(self.stage, lights, meshes)
+        lights, meshes = link(self.stage, lights, meshes)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
         if view is None:

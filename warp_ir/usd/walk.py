@@ -16,7 +16,7 @@ from warp_ir.usd.report import Report, Unreadable
 
 _DEPTH = 16
 """Deepest nesting of point instancers that is followed."""
-_LIGHT_COPIES = 100_000
+LIGHT_COPIES = 100_000
 """Most copies of one light."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
@@ -167,7 +167,7 @@ class _Walk:
         return True
 
     def _add_light(self, site: Site) -> None:
-        if site.level.total > _LIGHT_COPIES:
+        if site.level.total > LIGHT_COPIES:
             self._report.warn(site.prim.GetPath(), f"{site.level.total} copies of a light: too many, it is left out")
         else:
             self._found.lights.append(site)
