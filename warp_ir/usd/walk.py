@@ -123,6 +123,8 @@ class _Walk:
         elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
             if self._is_drawn(prim, name):
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
+        elif kind == "RenderPass":
+            report.warn(prim.GetPath(), "render passes are not read: all is drawn, in one picture")
         elif kind in ("LightFilter", "PluginLightFilter"):
             report.warn(prim.GetPath(), "light filters are not read")
         elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
