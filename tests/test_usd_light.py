@@ -168,9 +168,10 @@ def test_a_light_without_area_is_dropped(tmp_path):
 
 
 def test_lights_that_emit_nothing_are_counted(tmp_path):
-    """Intensity 0 drops a light silently, black does too, negative emission with a warning."""
-    scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = 0"))
-    assert scene.lights == () and scene.stats["lights_without_emission"] == 1 and not warned(scene, "/L")
+    """Intensity 0 drops a light silently if there are others, black does too, negative emission with a warning."""
+    sun = '\ndef DistantLight "Sun" {\n}\n'
+    scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = 0") + sun)
+    assert len(scene.lights) == 1 and scene.stats["lights_without_emission"] == 1 and not warned(scene, "/L")
     scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = -1"))
     assert scene.lights == () and warned(scene, "/L", "negative")
 

@@ -11,6 +11,7 @@ import numpy as np
 from pxr import Tf, Usd
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
+from warp_ir.usd.black import explain_blackness, explain_dark_lights
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import Geometry, build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
@@ -249,9 +250,13 @@ class StageReader:
         if not meshes:
             hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
             report.warn("/", f"the stage draws no geometry{hint}")
-        if not lights and not any(max(m.emission) > 0.0 for m in materials) and self._default_light == "dome":
-            report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
-            lights = (_DOME,)
+        if not lights and not any(max(m.emission) > 0.0 for m in materials):
+            dark = [site.prim for site in (*still.lamps, *still.moving.lights)]
+            dark += [self.stage.GetPrimAtPath(mesh.light.name) for mesh in meshes if mesh.light is not None]
+            explain_dark_lights(dark, time, report)
+            if self._default_light == "dome":
+                report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
+                lights = (_DOME,)
         stats = dict.fromkeys(_COUNTED, 0) | report.stats
         stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
         textures = {texture for material in materials for texture in material.textures}
@@ -267,7 +272,9 @@ class StageReader:
             along = "-Z" if self._axis == "Y" else "+Y"
             report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
             view = framing_camera(*scene.bounds(), self._axis)
-        return replace(scene, camera=view, warnings=report.lines(), stats=stats)
+        scene = replace(scene, camera=view, stats=stats)
+        explain_blackness(scene, report)
+        return replace(scene, warnings=report.lines())
 
     def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
         """What is drawn, and where; what stays the same at all times is read the first time."""
@@ -285,7 +292,7 @@ class StageReader:
         else:
             read, geometry, lights = self._still.read, self._still.geometry, self._still.lights
         report.include(read)
-        return _Still(key, moving, geometry, lights, read, report)
+        return _Still(key, moving, geometry, lights, tuple(staying.lights), read, report)
 
     def _with_moving(self, still: Geometry, sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> Geometry:
         """All geometry: what stays, what only changes its place, whose shape is read once, and what changes itself."""
@@ -309,6 +316,8 @@ class _Still:
     """What has to be read each time."""
     geometry: Geometry
     lights: tuple[Light, ...]
+    lamps: tuple[Site, ...]
+    """The lights that stay, those too that emit nothing."""
     read: Report
     """Of the geometry and the lights that stay."""
     report: Report
