@@ -84,10 +84,31 @@ class Sight:
 
 
 @wp.func
+def _visible_span(camera: CameraData, ray: Ray) -> wp.vec2:
+    """Nearest and farthest depth at which a camera ray sees anything; the same if it does not at all."""
+    near = camera.near
+    far = camera.far
+    for k in range(camera.plane_count):
+        plane = camera.planes[k]
+        n = wp.vec3(plane[0], plane[1], plane[2])
+        above = wp.dot(n, ray.origin - camera.origin) + plane[3]
+        rise = wp.dot(n, ray.direction)
+        if rise > 0.0:
+            near = wp.max(near, -above / rise)
+        elif rise < 0.0:
+            far = wp.min(far, -above / rise)
+        elif above < 0.0:
+            far = near
+    return wp.vec2(near, wp.max(near, far))
+
+
+@wp.func
 def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
     """Follows a camera ray."""
-    origin = ray.origin + ray.direction * camera.near
-    reach = camera.far - camera.near
+    span = _visible_span(camera, ray)
+    near = span[0]
+    origin = ray.origin + ray.direction * near
+    reach = span[1] - near
     hit = closest(scene, origin, ray.direction, reach)
     length = wp.length(ray.direction)
     towards = ray.direction / length
@@ -102,7 +123,7 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         if wp.length_sq(rise) > 0.0:
             sight.position += rise
             sight.normal = sight.shading_normal
-        sight.depth = hit.t + camera.near
+        sight.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
         sight.albedo = albedo(scene, hit, pixel)

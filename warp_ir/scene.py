@@ -31,6 +31,10 @@ CONFORM_POLICIES = (
 """How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
 
 
+MAX_CLIPPING_PLANES = 6
+"""Of a `Camera`: as many as a box has sides."""
+
+
 class InputError(ValueError):
     """The user's input cannot be rendered; the message is one line that says what and where."""
 
@@ -258,6 +262,9 @@ class Camera:
     """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
     focus_distance: float = 1.0
     """Depth along -Z at which a camera with a lens is sharp, in scene units."""
+    clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
+    """At most `MAX_CLIPPING_PLANES` of (a, b, c, d): camera rays see only where a x + b y + c z + d >= 0, x, y, z being
+    the place in the camera's space."""
 
     @property
     def aspect(self) -> float:
