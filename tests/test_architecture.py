@@ -16,7 +16,7 @@ PACKAGE = Path(ir.__file__).parent
 LAYERS = [
     ["placing"],
     ["scene"],
-    ["settings", "tonemap", "metrics", "denoise", "mipmap"],
+    ["settings", "tonemap", "metrics", "denoise", "mipmap", "cost"],
     ["profiling"],
     ["launch"],
     ["sampling"],
