@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_ir import LightKind, Scene, load_usd
+from warp_ir import LightKind, Scene, StageReader, load_usd
 
 
 def load(folder: Path, text: str, **options: object) -> Scene:
@@ -553,6 +553,25 @@ def Sphere "T" {}
     scene = load(tmp_path, text)
     glow = {mesh.name: scene.materials[mesh.material[0]].emission for mesh in scene.meshes}
     assert glow == {"/S": (3.0, 3.0, 3.0), "/T": (0.0, 0.0, 0.0)} and not warned(scene, "/L")
+
+
+def test_geometry_lights_may_change(tmp_path):
+    """Their inputs, and the transform that is the axis of their shaping, are read anew at every time."""
+    text = """def GeometryLight "L" (prepend apiSchemas = ["ShapingAPI"]) {
+    rel geometry = </S>
+    float inputs:intensity.timeSamples = { 0: 1, 2: 5 }
+    double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 2: (4, 0, 0) }
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+def Sphere "S" {
+}
+"""
+    (tmp_path / "a.usda").write_text("#usda 1.0\n" + text)
+    reader = StageReader(tmp_path / "a.usda")
+    for time in (0.0, 1.0, 2.0):
+        (mesh,) = (scene := reader.read(time)).meshes
+        assert scene.materials[mesh.material[0]].emission[0] == pytest.approx(1.0 + 2.0 * time)
+        assert mesh.light.name == "/L" and mesh.light.world_from_light[0, 3] == pytest.approx(2.0 * time)
 
 
 MESH_LIGHT = """def Mesh "M" (prepend apiSchemas = ["%s"]) {

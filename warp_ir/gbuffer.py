@@ -17,6 +17,7 @@ from warp_ir.surface import albedo, closest, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False})
 
+_FARTHEST = wp.constant(1.0e30)  # a plane that a ray meets only there is parallel to it
 _JITTER = wp.constant(wp.uint32(0x6A09E667))
 
 
@@ -99,7 +100,9 @@ def _visible_span(camera: CameraData, ray: Ray) -> wp.vec2:
             far = wp.min(far, -above / rise)
         elif above < 0.0:
             far = near
-    return wp.vec2(near, wp.max(near, far))
+    if near >= far or near > _FARTHEST:
+        return wp.vec2(camera.near, camera.near)
+    return wp.vec2(near, far)
 
 
 @wp.func

@@ -283,7 +283,8 @@ class StageReader:
         moving, staying = Found(), Found()
         for name in ("shapes", "lights"):
             for site in getattr(found, name):
-                getattr(moving if self._motion.moves(site.prim) else staying, name).append(site)
+                moves = self._motion.moves(site.prim) or (site.lamp is not None and self._motion.moves(site.lamp))
+                getattr(moving if moves else staying, name).append(site)
         if self._still is None or key != self._still.key:
             read = self._opened.part()
             geometry = build_meshes(staying.shapes, time, read, self._levels, images=self._images, metals=self._metals)
