@@ -23,7 +23,7 @@ LAYERS = [
     ["procedural", "usd", "bvh", "texture", "grid"],
     ["light_control"],
     ["device_scene"],
-    ["surface"],
+    ["surface", "solid_angle"],
     ["lights"],
     ["gbuffer"],
     ["vpl", "film"],

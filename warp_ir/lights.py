@@ -21,6 +21,7 @@ from warp_ir.grid import (
 )
 from warp_ir.light_control import linked, shaping_factor
 from warp_ir.scene import LightKind
+from warp_ir.solid_angle import aim_at, aim_density
 from warp_ir.surface import Hit, closest, emission, emitted, glow, has_glow, leave, offset, presence, visible
 
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +34,7 @@ _POINT = wp.constant(int(LightKind.POINT))
 _DISTANT = wp.constant(int(LightKind.DISTANT))
 _DOME = wp.constant(int(LightKind.DOME))
 _TRIANGLE = wp.constant(_TRIANGLE_EMITTER)
+_EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 _CROSSINGS = wp.constant(64)
 """Most surfaces without a shadow that light is followed through."""
 
@@ -47,6 +49,17 @@ class LightPoint:
     density: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
     emitter: int
     control: int  # row of its `LightControl`; -1: it has none
+
+
+@wp.struct
+class Arrival:
+    """Light that comes to a point from a random direction."""
+
+    direction: wp.vec3  # unit, towards the light
+    target: wp.vec4  # the place on the light, homogeneous
+    radiance: wp.vec3  # over the density of the direction: an estimate of ∫ L dω, unshadowed and unshaped
+    density: float  # of the direction, per solid angle; 0: no ray finds the light, only `sample_arrival`
+    control: int  # row of the light's `LightControl`; -1: it has none
 
 
 @wp.struct
@@ -83,25 +96,92 @@ class Emission:
 @wp.func
 def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
     """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
+    choice = _choose(scene, u_pick)
+    return _sample_emitter(scene, choice, u)
+
+
+@wp.struct
+class _Choice:
+    """A random emitter."""
+
+    emitter: int
+    probability: float
+    rest: float  # uniform in [0, 1) again, for what is left to choose
+
+
+@wp.func
+def _choose(scene: SceneData, u: float) -> _Choice:
     low = int(0)
     high = scene.emitter_count
     while high - low > 1:
         middle = (low + high) // 2
-        if scene.emitter_cdf[middle] <= u_pick:
+        if scene.emitter_cdf[middle] <= u:
             low = middle
         else:
             high = middle
-    probability = scene.emitter_cdf[low + 1] - scene.emitter_cdf[low]
-    rest = (u_pick - scene.emitter_cdf[low]) / probability  # uniform again, for what is left to choose
-    item = scene.emitter_item[low]
-    out = LightPoint()
-    if scene.emitter_kind[low] == _TRIANGLE:
-        out = _sample_triangle(scene, item, probability, rest, u)
-    elif scene.emitter_kind[low] <= _CYLINDER:
-        out = _sample_shape(scene, item, probability, u)
-    else:
-        out = _sample_point_or_direction(scene, item, probability, u)
+    out = _Choice()
     out.emitter = low
+    out.probability = scene.emitter_cdf[low + 1] - scene.emitter_cdf[low]
+    out.rest = (u - scene.emitter_cdf[low]) / out.probability
+    return out
+
+
+@wp.func
+def _sample_emitter(scene: SceneData, choice: _Choice, u: wp.vec2) -> LightPoint:
+    item = scene.emitter_item[choice.emitter]
+    kind = scene.emitter_kind[choice.emitter]
+    out = LightPoint()
+    if kind == _TRIANGLE:
+        out = _sample_triangle(scene, item, choice.probability, choice.rest, u)
+    elif kind <= _CYLINDER:
+        out = _sample_shape(scene, item, choice.probability, u)
+    else:
+        out = _sample_point_or_direction(scene, item, choice.probability, u)
+    out.emitter = choice.emitter
+    return out
+
+
+@wp.func
+def sample_arrival(scene: SceneData, position: wp.vec3, u_pick: float, u: wp.vec2) -> Arrival:
+    """Light that may come to a point: from which emitter, in proportion to power; if it is a shape, by solid angle."""
+    choice = _choose(scene, u_pick)
+    item = scene.emitter_item[choice.emitter]
+    out = Arrival()
+    if scene.emitter_kind[choice.emitter] <= _CYLINDER and _texture_of(scene, item) < 0:
+        aim = aim_at(
+            scene.light_kind[item],
+            scene.light_axes[item],
+            scene.light_inverse[item],
+            scene.light_origin[item] - position,
+            u,
+        )
+        if not aim.density > 0.0:
+            return out
+        out.direction = wp.normalize(aim.way)
+        off = -out.direction
+        if scene.light_kind[item] <= _DISK:
+            off = wp.normalize(_axis(scene, item))
+        p = position + aim.way
+        p += off * (wp.max(wp.abs(p)) * _EIGHT_ULP)  # a light often lies in the ceiling's plane
+        out.target = wp.vec4(p[0], p[1], p[2], 1.0)
+        out.density = aim.density * choice.probability
+        out.radiance = scene.light_radiance[item] / out.density
+        out.control = control_of(scene, item)
+        if _only_sampled(scene, out.control):
+            out.density = 0.0
+        return out
+    point = _sample_emitter(scene, choice, u)
+    xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
+    to_light = xyz - position * point.position[3]
+    squared = wp.dot(to_light, to_light)
+    out.direction = to_light / wp.sqrt(squared)
+    facing = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
+    per_area = wp.max(0.0, point.normal[3] - wp.dot(facing, out.direction)) / squared
+    out.target = point.position
+    out.radiance = point.intensity * per_area
+    if per_area > 0.0:
+        out.density = point.density / per_area
+    out.control = point.control
     return out
 
 
@@ -207,7 +287,7 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
     out = LightPoint()
     out.density = probability * relative / (_unit_area(kind) * _area_scale(scene, light, n))
-    p += world_n * (wp.max(wp.abs(p)) * 9.5367431640625e-07)  # 8 ulp: a light often lies in the ceiling's plane
+    p += world_n * (wp.max(wp.abs(p)) * _EIGHT_ULP)  # a light often lies in the ceiling's plane
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
     out.intensity = radiance / out.density
@@ -219,7 +299,7 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
 
 @wp.func
 def _axis(scene: SceneData, light: int) -> wp.vec3:
-    """The unit direction towards a distant light."""
+    """The unit direction towards a distant light; along the normal of a flat one."""
     m = scene.light_axes[light]
     return wp.vec3(m[0, 2], m[1, 2], m[2, 2])
 
@@ -501,11 +581,21 @@ def _place(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t:
 
 
 @wp.func
+def power_heuristic(density: float, other: float) -> float:
+    """Weight of a sample that another way of sampling might have found as well (Veach 1997, β = 2).
+
+    Where one way is nearly exact, as towards the lights, it leaves less of the other's noise than the balance does.
+    """
+    ratio = other / density
+    return 1.0 / (1.0 + ratio * ratio)
+
+
+@wp.func
 def _weight(bsdf_density: float, light_density: float) -> float:
-    """The balance heuristic (Veach 1997); 1 if the ray was no sample of a BSDF."""
+    """Of a light that a ray has found; 1 if the ray was no sample of a BSDF."""
     if bsdf_density < 0.0:
         return 1.0
-    return bsdf_density / (bsdf_density + light_density)
+    return power_heuristic(bsdf_density, light_density)
 
 
 @wp.func
@@ -533,23 +623,32 @@ def lights_found(
             light = scene.shape_light[shape]
             hit = _hit_shape(scene, light, origin, direction)
             if hit[3] > 0.0 and hit[3] < t_max and _may_find(scene, control_of(scene, light), mesh, bsdf_density):
-                n = wp.vec3(hit[0], hit[1], hit[2])
-                world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
-                cosine = -wp.dot(world_n, direction)
-                area = _unit_area(scene.light_kind[light]) * _area_scale(scene, light, n)
-                density = _probability(scene, scene.light_emitter[light]) * hit[3] * hit[3] / (area * cosine)
-                if _texture_of(scene, light) >= 0:
-                    place = _place(scene, light, origin, direction, hit[3])
-                    density *= place_density(scene.light_tables[0].grids, _texture_of(scene, light), place)
-                if cosine > 0.0:
-                    radiance = _face_radiance(scene, light, origin, direction, hit[3])
-                    radiance = wp.cw_mul(radiance, _shaping(scene, control_of(scene, light), -direction))
-                    total += radiance * _weight(bsdf_density, density)
+                radiance = _face_radiance(scene, light, origin, direction, hit[3])
+                radiance = wp.cw_mul(radiance, _shaping(scene, control_of(scene, light), -direction))
+                if bsdf_density >= 0.0:
+                    radiance = radiance * _weight(bsdf_density, _found_density(scene, light, origin, direction, hit[3]))
+                total += radiance
     if escapes:
         for light in range(scene.light_count):
             if scene.light_kind[light] >= _DISTANT and _may_find(scene, control_of(scene, light), mesh, bsdf_density):
                 total += _from_infinity(scene, light, direction, bsdf_density)
     return total
+
+
+@wp.func
+def _found_density(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> float:
+    """The density per solid angle with which `sample_arrival` gives a direction that meets a shape at t."""
+    kind = scene.light_kind[light]
+    probability = _probability(scene, scene.light_emitter[light])
+    texture = _texture_of(scene, light)
+    if texture < 0:
+        to_light = scene.light_origin[light] - origin
+        return probability * aim_density(kind, scene.light_axes[light], scene.light_inverse[light], to_light, direction)
+    n = wp.vec3(0.0, 0.0, 1.0)  # only rectangles have textures
+    cosine = -wp.dot(wp.normalize(wp.transpose(scene.light_inverse[light]) * n), direction)
+    density = probability * t * t / (_unit_area(kind) * _area_scale(scene, light, n) * cosine)
+    place = _place(scene, light, origin, direction, t)
+    return density * place_density(scene.light_tables[0].grids, texture, place)
 
 
 @wp.func
