@@ -208,3 +208,50 @@ def test_a_camera_beyond_all_floats_is_an_error():
     camera.world_from_camera[0, 3] = 1e300
     with pytest.raises(ir.InputError, match="too far"):
         render(glowing(FLOOR, camera), width=4, iterations=1)
+
+
+@pytest.mark.parametrize("estimator", ["vpl", "path"])
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_clipping_planes_cut_what_the_camera_sees(estimator, orthographic):
+    """Planes in the camera's space cut camera rays alone: what is cut away still lights and shadows the rest.
+
+    A wall at a depth of 3, one in front of it at a depth of 2, in a scene of 100 times the camera's units, aside.
+    """
+    at = np.eye(4)
+    at[:3, 3] = 100.0, 200.0, 303.0
+    camera = ir.Camera(world_from_camera=at, window=(-0.2, 0.2, -0.2, 0.2))
+    if orthographic:
+        camera = replace(camera, projection=ir.Projection.ORTHOGRAPHIC)
+    glow = ir.Material("glow", albedo=(0.0,) * 3, emission=(1.0,) * 3)
+    grey = ir.Material("grey", albedo=(0.5,) * 3)
+    place = at[:3, 3] - [0.0, 0.0, 3.0]
+    behind, before = quad("behind", 2.0 * FLOOR + place, 1), quad("before", 2.0 * FLOOR + place + [0, 0, 1.0], 0)
+    # The nearer one turns its dark side to the camera, and lights the other.
+    before = replace(before, triangles=before.triangles[:, ::-1].copy())
+
+    def look(*planes):
+        scene = ir.Scene((behind, before), (glow, grey), camera=replace(camera, clipping_planes=planes))
+        return render(scene, width=8, height=8, iterations=64, estimator=estimator, max_bounces=0)
+
+    whole = look()
+    assert (whole.aov("prim_id") == 1).all() and whole.radiance().max() == 0.0
+    film = look((0.0, 0.0, -1.0, -2.5))  # depth > 2.5
+    assert (film.aov("prim_id") == 0).all()
+    np.testing.assert_allclose(film.aov("depth"), 3.0, rtol=1e-5)
+    # L ρ F, with the form factor of a square of side 4 at a distance of 1 from a point opposite its middle.
+    x = 2.0 / math.sqrt(5.0)
+    expected = 0.5 * 4.0 / math.pi * x * math.atan(x)
+    error = film.standard_error().mean()
+    assert abs(film.radiance().mean() - expected) < 5.0 * error + 5e-3 * expected
+    half = look((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -5.0, -12.5))  # the right half of it; planes need no unit normal
+    assert (half.aov("prim_id")[:, 4:] == 0).all() and (half.aov("prim_id")[:, :4] == -1).all()
+    assert (look((0.0, 0.0, 1.0, 1.0)).aov("prim_id") == -1).all()  # depth < 1
+    assert (look((0.0, 0.0, 1.0, 1.0), (0.0, 0.0, -1.0, -2.5)).aov("prim_id") == -1).all()  # nothing at all
+
+
+def test_bad_clipping_planes_are_refused():
+    """More than a box has sides, or not finite: an error that names the camera."""
+    for planes in (((1.0, 0.0, 0.0, 0.0),) * 7, ((math.nan, 0.0, 0.0, 1.0),)):
+        camera = ir.Camera("odd", clipping_planes=planes)
+        with pytest.raises(ir.InputError, match="odd"):
+            render(glowing(FLOOR, camera), width=2, height=2, iterations=1)

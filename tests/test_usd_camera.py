@@ -96,10 +96,17 @@ def test_an_empty_clipping_range_clips_nothing(tmp_path):
     assert scene.camera.clipping == (0.0, math.inf) and warned(scene, "/C", "clippingRange")
 
 
-def test_clipping_planes_are_named(tmp_path):
-    """What the picture will not lack is said."""
-    scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 1, 2)]"))
-    assert warned(scene, "/C", "clippingPlanes")
+def test_clipping_planes(tmp_path):
+    """They are read as they are; what is no plane, or more than a box has sides, is ignored and named."""
+    scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 1, 2), (1, 0, 0, -3)]"))
+    assert scene.camera.clipping_planes == ((0.0, 0.0, 1.0, 2.0), (1.0, 0.0, 0.0, -3.0)) and not warned(scene, "/C")
+    scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 0, 2), (nan, 0, 0, 1)]"))
+    assert scene.camera.clipping_planes == () and warned(scene, "/C", "clippingPlanes: 2 that are no planes")
+    planes = ", ".join(["(1, 0, 0, 5)"] * 7)
+    scene = load(tmp_path, camera_text(f"float4[] clippingPlanes = [{planes}]"))
+    assert len(scene.camera.clipping_planes) == 6 and warned(scene, "/C", "of 7 the first 6")
+    scene = load(tmp_path, camera_text("int[] clippingPlanes = [1, 2]"))
+    assert scene.camera.clipping_planes == () and warned(scene, "/C", "clippingPlanes")
 
 
 @pytest.mark.parametrize("name", ["focalLength", "horizontalAperture", "verticalAperture"])

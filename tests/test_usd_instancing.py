@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom
 
 from warp_ir import InputError, Scene, load_usd
 from warp_ir.image import write_image
@@ -485,3 +486,41 @@ print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_m
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     seconds, memory = (float(x) for x in out.split()[-2:])
     assert seconds < 60.0 and memory < 2.0e9, out
+
+
+@pytest.mark.parametrize("time", [1.0, 1.75, 3.0, 4.5])
+def test_velocities_carry_instances_between_samples(tmp_path, time):
+    """Velocities, accelerations and angular velocities place instances as ComputeInstanceTransformsAtTime does."""
+    text = "(\n    timeCodesPerSecond = 2\n    endTimeCode = 6\n)\n" + instancer("""
+    int[] protoIndices = [0, 0]
+    point3f[] positions.timeSamples = {
+        1: [(0, 0, 0), (5, 0, 0)], 3: [(9, 9, 9), (5, 5, 5)], 5: [(0, 0, 0), (1, 1, 1)] }
+    vector3f[] velocities.timeSamples = {
+        1: [(1, 2, 0), (0, 0, 3)], 3: [(2, 0, 0), (0, 1, 0)], 5: [(0, 0, 0), (0, 0, 0)] }
+    vector3f[] accelerations.timeSamples = {
+        1: [(0, 0, 4), (1, 0, 0)], 3: [(1, 0, 0), (0, 0, 0)], 5: [(0, 0, 0), (0, 0, 0)] }
+    quath[] orientations.timeSamples = {
+        1: [(1, 0, 0, 0), (0.5, 0.5, 0.5, 0.5)], 3: [(0, 1, 0, 0), (1, 0, 0, 0)], 5: [(1, 0, 0, 0), (1, 0, 0, 0)] }
+    vector3f[] angularVelocities.timeSamples = {
+        1: [(0, 0, 90), (30, 0, 10)], 3: [(10, 20, 30), (0, 45, 0)], 5: [(0, 0, 0), (0, 0, 0)] }
+    float3[] scales = [(1, 2, 3), (1, 1, 1)]
+""")
+    scene = load(tmp_path, text, time=time)
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
+    instances = UsdGeom.PointInstancer(stage.GetPrimAtPath("/P"))
+    at = Usd.TimeCode(time)
+    places = instances.ComputeInstanceTransformsAtTime(at, at, UsdGeom.PointInstancer.ExcludeProtoXform)
+    triangle = np.array([(0, 0, 0, 1), (1, 0, 0, 1), (0, 1, 0, 1)])
+    expected = np.stack([triangle @ np.array(place) for place in places])[..., :3]
+    np.testing.assert_allclose(corners(scene), expected[np.lexsort(expected[:, 0].round(9).T)], atol=2e-3)
+
+
+def test_bad_angular_velocities_are_named(tmp_path):
+    """An array of another length turns nothing, and is named."""
+    text = "(\n    endTimeCode = 6\n)\n" + instancer("""
+    int[] protoIndices = [0]
+    point3f[] positions = [(0, 0, 0)]
+    quath[] orientations.timeSamples = { 1: [(1, 0, 0, 0)], 3: [(0, 1, 0, 0)] }
+    vector3f[] angularVelocities.timeSamples = { 1: [(0, 0, 90), (1, 1, 1)], 3: [(10, 20, 30)] }
+""")
+    assert warned(load(tmp_path, text, time=2.0), "/P", "angularVelocities has 2 values")

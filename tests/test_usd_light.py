@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_ir import LightKind, Scene, load_usd
+from warp_ir import LightKind, Scene, StageReader, load_usd
 
 
 def load(folder: Path, text: str, **options: object) -> Scene:
@@ -168,9 +168,10 @@ def test_a_light_without_area_is_dropped(tmp_path):
 
 
 def test_lights_that_emit_nothing_are_counted(tmp_path):
-    """Intensity 0 drops a light silently, black does too, negative emission with a warning."""
-    scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = 0"))
-    assert scene.lights == () and scene.stats["lights_without_emission"] == 1 and not warned(scene, "/L")
+    """Intensity 0 drops a light silently if there are others, black does too, negative emission with a warning."""
+    sun = '\ndef DistantLight "Sun" {\n}\n'
+    scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = 0") + sun)
+    assert len(scene.lights) == 1 and scene.stats["lights_without_emission"] == 1 and not warned(scene, "/L")
     scene = load(tmp_path, light_text("RectLight", "float inputs:intensity = -1"))
     assert scene.lights == () and warned(scene, "/L", "negative")
 
@@ -213,6 +214,13 @@ SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
         ("GeometryLight", "", "", "geometry"),
         ("PluginLight", "", "", "PluginLight"),
         ("LightFilter", "", "", "light filters are not read"),
+        ("RenderPass", "", "", "render passes are not read"),
+        (
+            "DomeLight",
+            "",
+            'asset inputs:texture:file = @nowhere.exr@\ntoken inputs:texture:format = "odd"',
+            "no layout",
+        ),
     ],
 )
 def test_what_is_not_honoured_is_named(tmp_path, kind, head, more, word):
@@ -310,6 +318,31 @@ def test_symmetric_photometry_goes_all_round(tmp_path, horizontal, at, same):
     assert all(value(p) == pytest.approx(value(at), rel=0.05) for p in same)
 
 
+@pytest.mark.parametrize(("kind", "plane"), [(2, "B"), (3, "A")])
+def test_photometry_of_headlamps_and_floodlights(tmp_path, kind, plane):
+    """Types A and B count from the aim, to the right (+X) and up (+Y): A around the vertical axis, B the horizontal.
+
+    Candela 200 + 2 h + v, linear in both angles, so that interpolation is exact; directions from their definitions.
+    """
+    h, v = [-90, -30, 0, 90], [-90, 0, 45, 90]
+    table = profile(tmp_path, photometry(v, h, [[300 + 2 * x + y for y in v] for x in h], kind=kind))
+    rows, columns = table.shape
+    for across, above in ((0.0, 40.0), (-50.0, 0.0), (30.0, 60.0), (20.0, -70.0)):
+        a, b = np.radians(across), np.radians(above)
+        direction = (np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b))
+        if plane == "B":
+            direction = (np.sin(a), np.cos(a) * np.sin(b), np.cos(a) * np.cos(b))
+        theta = np.degrees(np.arccos(direction[2]))
+        phi = np.degrees(np.arctan2(direction[1], direction[0])) % 360.0
+        found = table[int(theta / 180.0 * rows), int(phi / 360.0 * columns)]
+        assert found == pytest.approx(300 + 2 * across + above, abs=3.0)  # half a cell of 0.25° and 1° away
+    assert (table[rows // 2 :] == 0.0).all()
+    # From 0° alone, both sides are the same.
+    half = profile(tmp_path, photometry([0, 90], [0, 90], [[100, 10], [10, 1]], kind=kind))
+    np.testing.assert_allclose(half, half[:, ::-1], atol=1e-9)
+    np.testing.assert_allclose(half, np.roll(half[:, ::-1], columns // 2, axis=1), atol=1e-9)
+
+
 def test_photometry_scales_and_normalizes(tmp_path):
     """An angleScale of 1/2 narrows the beam to half its angle; normalized, the mean over the (hemi)sphere is 1."""
     file = photometry([0, 60, 60.001, 90], [0], [[100, 100, 0, 0]])
@@ -335,12 +368,14 @@ def test_photometry_scales_and_normalizes(tmp_path):
         photometry([0, 90], [0], [["nan", 1]]),
         photometry([90, 0], [0], [[1, 1]]),
         photometry([0, 90], [0], [["many", 1]]),
-        photometry([0, 90], [0], [[1, 1]], kind=2),
+        photometry([0, 90], [0], [[1, 1]], kind=4),
+        photometry([-90, 91], [0], [[1, 1]], kind=2),
+        photometry([-1, 90], [0], [[1, 1]]),
         "\x00\xff" * 100,
     ],
 )
 def test_bad_photometry_is_named(tmp_path, content):
-    """A file that is no photometry of type C leaves the light unshaped, and says so."""
+    """A file that is no photometry leaves the light unshaped, and says so."""
     (tmp_path / "lamp.ies").write_text(content)
     scene = load(tmp_path, light_text("SphereLight", IES, SHAPED))
     assert scene.lights[0].shaping is None and warned(scene, "/L", "lamp.ies")
@@ -396,6 +431,55 @@ def test_the_pole_of_a_dome(tmp_path, kind, axis, pole, up):
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
     if up == (0, 0, 1):  # (x, y, z) → (x, z, -y): the middle of the texture, local +Z, lies along -Y
         np.testing.assert_allclose(matrix[:3, 2], (0, -1, 0), atol=1e-12)
+
+
+def directions(layout, size):
+    """The directions that the pixels of an image show, from the layouts' definitions: [h, w, 3], NaN where none."""
+    if layout == "cubeMapVerticalCross":
+        out = np.full((4 * size, 3 * size, 3), np.nan)
+        a = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+        x, y = np.meshgrid(a, -a)
+        one = np.ones_like(x)
+        faces = {(0, 1): (x, one, -y), (1, 0): (-one, y, x), (1, 1): (x, y, one), (1, 2): (one, y, -x),
+                 (2, 1): (x, -one, y), (3, 1): (x, -y, -one)}  # fmt: skip
+        for (row, column), face in faces.items():
+            out[row * size : (row + 1) * size, column * size : (column + 1) * size] = np.stack(face, axis=-1)
+        return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    a = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+    x, y = np.meshgrid(a, -a)
+    r = np.hypot(x, y)
+    theta = np.pi * r if layout == "angular" else 2.0 * np.arcsin(np.minimum(r, 1.0))
+    out = np.stack([x / r * np.sin(theta), y / r * np.sin(theta), np.cos(theta)], axis=-1)
+    return np.where(r[..., None] <= 1.0, out, np.nan)
+
+
+@pytest.mark.parametrize("layout", ["angular", "mirroredBall", "cubeMapVerticalCross"])
+def test_layouts_of_domes(tmp_path, layout):
+    """A sky of L = 2 + d · (0.5, 1, 0.2) in any layout becomes the lat-long sky of the same radiance.
+
+    Half a pixel of 200 or so is 0.016 rad at most; the back of a mirrored ball, compressed into its rim, is left out.
+    """
+    slope = np.array([0.5, 1.0, 0.2])
+    d = directions(layout, 100 if layout == "cubeMapVerticalCross" else 256)
+    sky = np.nan_to_num(2.0 + d @ slope, nan=7.0)
+    write_exr(tmp_path / "t.exr", np.repeat(sky[:, :, None], 3, axis=2).astype(np.float32))
+    more = f'asset inputs:texture:file = @./t.exr@\ntoken inputs:texture:format = "{layout}"'
+    scene = load(tmp_path, light_text("DomeLight", more))
+    assert not warned(scene, "/L")
+    texture = scene.lights[0].texture
+    height, width = texture.shape[:2]
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    around, polar = (0.5 - u) * 2.0 * np.pi, v * np.pi
+    shown = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], axis=-1)
+    well = shown[..., 2] > -0.95
+    np.testing.assert_allclose(texture[..., 0][well], (2.0 + shown @ slope)[well], atol=0.02)
+
+
+def test_a_cross_of_another_shape_is_named(tmp_path):
+    """An image that is not 3 x 4 faces is no vertical cross."""
+    write_exr(tmp_path / "t.exr", np.ones((8, 8, 3), np.float32))
+    more = 'asset inputs:texture:file = @./t.exr@\ntoken inputs:texture:format = "cubeMapVerticalCross"'
+    assert warned(load(tmp_path, light_text("DomeLight", more)), "/L", "no vertical cross")
 
 
 def test_shadows_can_be_switched_off(tmp_path):
@@ -471,6 +555,25 @@ def Sphere "T" {}
     assert glow == {"/S": (3.0, 3.0, 3.0), "/T": (0.0, 0.0, 0.0)} and not warned(scene, "/L")
 
 
+def test_geometry_lights_may_change(tmp_path):
+    """Their inputs, and the transform that is the axis of their shaping, are read anew at every time."""
+    text = """def GeometryLight "L" (prepend apiSchemas = ["ShapingAPI"]) {
+    rel geometry = </S>
+    float inputs:intensity.timeSamples = { 0: 1, 2: 5 }
+    double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 2: (4, 0, 0) }
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+def Sphere "S" {
+}
+"""
+    (tmp_path / "a.usda").write_text("#usda 1.0\n" + text)
+    reader = StageReader(tmp_path / "a.usda")
+    for time in (0.0, 1.0, 2.0):
+        (mesh,) = (scene := reader.read(time)).meshes
+        assert scene.materials[mesh.material[0]].emission[0] == pytest.approx(1.0 + 2.0 * time)
+        assert mesh.light.name == "/L" and mesh.light.world_from_light[0, 3] == pytest.approx(2.0 * time)
+
+
 MESH_LIGHT = """def Mesh "M" (prepend apiSchemas = ["%s"]) {
     point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]
     int[] faceVertexCounts = [4]
@@ -508,6 +611,78 @@ def test_a_mesh_light_is_an_emissive_surface(tmp_path, more, emission, albedo):
     (material,) = scene.materials
     assert material.emission == pytest.approx(emission) and material.albedo[0] == pytest.approx(albedo)
     assert scene.lights == () and not scene.meshes[0].double_sided
+
+
+def test_the_camera_sees_the_glow_of_an_independent_material(tmp_path):
+    """MaterialSyncMode = independent: the eye sees the material's emission, the scene is lit by the light's alone."""
+    more = BIND + 'uniform token light:materialSyncMode = "independent"'
+    (material,) = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials
+    assert material.glow == (1.0, 0.5, 0.0) and material.emission == (12.0, 12.0, 12.0)
+    for mode in ("noMaterialResponse", "materialGlowTintsLight"):
+        more = BIND + f'uniform token light:materialSyncMode = "{mode}"'
+        assert load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials[0].glow is None
+
+
+def test_mesh_lights_have_shaping_links_and_shadows(tmp_path):
+    """ShapingAPI, ShadowAPI and the links of a surface that emits are read as those of any light, without a word."""
+    more = """bool inputs:shadow:enable = false
+    float inputs:shaping:cone:angle = 20
+    float inputs:shaping:focus = 3
+    rel collection:lightLink:excludes = [</N>]
+    rel collection:shadowLink:excludes = [</M>]
+    double3 xformOp:translate = (0, 0, 5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]"""
+    apis = 'MeshLightAPI", "ShapingAPI", "ShadowAPI'
+    scene = load(tmp_path, MESH_LIGHT % (apis, more) + 'def Sphere "N" {}\n')
+    light = scene.meshes[0].light
+    assert light.shaping.cone_angle == 20.0 and light.shaping.focus == 3.0 and not light.shadows
+    assert light.unlit == {1} and light.shadowless == {0} and scene.meshes[1].light is None
+    assert light.world_from_light[2, 3] == 5.0 and not warned(scene, "/M")
+
+
+def test_places_of_a_mesh_light_that_differ_are_told_apart(tmp_path):
+    """Every copy of a shaped light has its axis; of a normalized one its radiance, by its own area."""
+    text = """def Xform "P" {
+    def Mesh "M" (prepend apiSchemas = ["MeshLightAPI"%s]) {
+        point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]
+        int[] faceVertexCounts = [4]
+        int[] faceVertexIndices = [0, 1, 2, 3]
+        uniform token subdivisionScheme = "none"
+        float inputs:intensity = 12
+        bool inputs:normalize = true
+    }
+}
+def PointInstancer "I" {
+    rel prototypes = </P>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = [(0, 0, 0), (10, 0, 0)]
+    float3[] scales = [(1, 1, 1), %s]
+    quath[] orientations = [(1, 0, 0, 0), (0, 1, 0, 0)]
+}
+"""
+    alike = load(tmp_path, text % ("", "(1, 1, 1)"))
+    assert [len(mesh.triangles) for mesh in alike.meshes] == [2, 4]
+    scaled = load(tmp_path, text % ("", "(2, 2, 2)"))
+    emission = [scaled.materials[mesh.material[0]].emission[0] for mesh in scaled.meshes]
+    assert emission == pytest.approx([2.0, 2.0, 0.5])
+    shaped = load(tmp_path, text % (', "ShapingAPI"', "(1, 1, 1)"))
+    assert [mesh.light.world_from_light[2, 2] for mesh in shaped.meshes] == pytest.approx([1.0, 1.0, -1.0])
+
+
+def test_textures_of_mesh_lights(tmp_path):
+    """texture:file multiplies the emission and is placed by the mesh's st."""
+    pixels = np.zeros((2, 2, 3), np.float32)
+    pixels[0, 1] = (1.0, 0.5, 0.25)
+    write_exr(tmp_path / "t.exr", pixels)
+    more = """asset inputs:texture:file = @t.exr@
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")"""
+    scene = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more))
+    texture = scene.materials[0].emission_texture
+    np.testing.assert_allclose(texture.pixels, 12.0 * pixels, rtol=1e-3)
+    np.testing.assert_array_equal(scene.meshes[0].uvs[texture.uv][0], [(0, 0), (1, 0), (1, 1)])
+    assert not warned(scene, "/M")
+    scene = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", "asset inputs:texture:file = @t.exr@"))
+    assert warned(scene, "/M", "no primvar 'st'")
 
 
 def test_any_gprim_can_be_a_light(tmp_path):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from warp_ir.scene import LightKind as LightKind
     from warp_ir.scene import Material as Material
     from warp_ir.scene import Mesh as Mesh
+    from warp_ir.scene import MeshLight as MeshLight
     from warp_ir.scene import Projection as Projection
     from warp_ir.scene import Scene as Scene
     from warp_ir.scene import Shaping as Shaping
@@ -37,6 +38,7 @@ _HOME = {
     "LightKind": "scene",
     "Material": "scene",
     "Mesh": "scene",
+    "MeshLight": "scene",
     "Projection": "scene",
     "Scene": "scene",
     "Shaping": "scene",

@@ -12,11 +12,12 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
-from warp_ir.lights import lights_found
-from warp_ir.surface import albedo, closest, emission, shading_normal, smooth_rise
+from warp_ir.lights import lights_found, surface_seen
+from warp_ir.surface import albedo, closest, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False})
 
+_FARTHEST = wp.constant(1.0e30)  # a plane that a ray meets only there is parallel to it
 _JITTER = wp.constant(wp.uint32(0x6A09E667))
 
 
@@ -84,11 +85,36 @@ class Sight:
 
 
 @wp.func
+def _visible_span(camera: CameraData, ray: Ray) -> wp.vec2:
+    """Nearest and farthest depth at which a camera ray sees anything; the same if it does not at all."""
+    near = camera.near
+    far = camera.far
+    for k in range(camera.plane_count):
+        plane = camera.planes[k]
+        n = wp.vec3(plane[0], plane[1], plane[2])
+        above = wp.dot(n, ray.origin - camera.origin) + plane[3]
+        rise = wp.dot(n, ray.direction)
+        if rise > 0.0:
+            near = wp.max(near, -above / rise)
+        elif rise < 0.0:
+            far = wp.min(far, -above / rise)
+        elif above < 0.0:
+            far = near
+    if near >= far or near > _FARTHEST:
+        return wp.vec2(camera.near, camera.near)
+    return wp.vec2(near, far)
+
+
+@wp.func
 def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
     """Follows a camera ray."""
-    origin = ray.origin + ray.direction * camera.near
-    reach = camera.far - camera.near
+    span = _visible_span(camera, ray)
+    near = span[0]
+    origin = ray.origin + ray.direction * near
+    reach = span[1] - near
     hit = closest(scene, origin, ray.direction, reach)
+    length = wp.length(ray.direction)
+    towards = ray.direction / length
     sight = Sight()
     sight.mesh = -1
     if hit.triangle >= 0:
@@ -100,15 +126,13 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         if wp.length_sq(rise) > 0.0:
             sight.position += rise
             sight.normal = sight.shading_normal
-        sight.depth = hit.t + camera.near
+        sight.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
         sight.albedo = albedo(scene, hit, pixel)
-        sight.emission = emission(scene, hit, pixel)
+        sight.emission = surface_seen(scene, hit, towards, pixel)
         reach = hit.t
     if camera.shows_lights == 1:
-        length = wp.length(ray.direction)
-        towards = ray.direction / length
         sight.emission += lights_found(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
     return sight
 

@@ -4,6 +4,7 @@ Only lights that ask for any of it have a `LightControl`; a scene without one pa
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import warp as wp
 
 from warp_ir.grid import GridList, GridTables, cell_means, cell_measure, value_along
 from warp_ir.launch import Launcher
-from warp_ir.scene import InputError, Light, LightKind, Shaping
+from warp_ir.scene import InputError, Light, LightKind, Mesh, MeshLight, Shaping
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,6 +21,8 @@ _BANDS = 1024
 """Rows of the table from which the photons of a shaped light take their directions."""
 _LEAST = 0.05
 """Smallest `emphasis` in the support of a shaped light: what is dim there is found now and then."""
+_ALONG = 0.999999
+"""Cosine to the axis of shaping above which a flat light faces along it."""
 _SPHERE_WASTE = 8.0 / 3.0
 """E[w²]/E[w]² of photons w = cos⁺θ that leave a sphere in a direction chosen apart from the place: (1/6) / (1/4)²."""
 
@@ -52,11 +55,14 @@ class ControlTables:
     count: int
     shaped_count: int  # of them with a shaping
     of_light: wp.array[wp.int32]  # [lights], row of `rows` or -1
+    surface_count: int  # meshes with a control
+    of_mesh: wp.array[wp.int32]  # [meshes], likewise; one row if none has any
     rows: wp.array[LightControl]
     meshes: int
     links: wp.array[wp.int32]  # [link rows x meshes], 1: the mesh is in the set
     sampled_count: int  # lights with an area that see other surfaces than rays do
     sampled: wp.array[wp.int32]  # those lights
+    sampled_surfaces: int  # meshes that do, and emit
 
 
 @wp.func(inline=False)
@@ -96,20 +102,20 @@ def linked(tables: ControlTables, row: int, mesh: int) -> bool:
     return tables.links[row * tables.meshes + mesh] == 1
 
 
-def needs_control(light: Light) -> bool:
+def needs_control(light: Light | MeshLight) -> bool:
     """Whether a light asks for anything beyond its radiance and shape."""
     return light.shaping is not None or not light.shadows or bool(light.unlit) or bool(light.shadowless)
 
 
 def upload_controls(
-    lights: tuple[Light, ...], axes: Any, meshes: int, grids: GridList, launcher: Launcher
+    lights: tuple[Light, ...], axes: Any, meshes: Sequence[Mesh], grids: GridList, launcher: Launcher
 ) -> tuple[Any, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """The `ControlTables`, and for every light what shaping makes of its radiance and of its power.
 
     Args:
         lights: Of the scene.
         axes: Their axes in the device's frame [lights, 3, 3]; the third column of a flat light is its unit normal.
-        meshes: Number of meshes in the scene.
+        meshes: Of the scene; those that are lights have controls too.
         grids: Takes the profiles and the directions of photons.
         launcher: Where to.
 
@@ -120,58 +126,139 @@ def upload_controls(
     Raises:
         InputError: A value is not usable; the message names the light.
     """
+    rows = _Rows(len(meshes), grids)
     of_light = np.full(max(len(lights), 1), -1, np.int32)
-    rows: list[tuple[Any, ...]] = []
-    links: dict[frozenset[int], int] = {}
     radiance, power = np.ones(len(lights)), np.ones(len(lights))
     for k, light in enumerate(lights):
         if not needs_control(light):
             continue
-        for link in (light.unlit, light.shadowless):
-            if any(not 0 <= mesh < meshes for mesh in link):
-                raise InputError(f"{light.name}: it is linked to meshes outside 0..{meshes - 1}")
-        frame = _frame(light)
-        shaping = light.shaping or Shaping()
-        _check(light.name, shaping)
-        profile, photons = -1, -1
-        if light.shaping is not None:
-            if shaping.profile is not None:
-                radiance[k] = float(shaping.profile.max())
-                table = shaping.profile / max(radiance[k], 1.0e-30)
-                profile = grids.add(np.repeat(table[:, :, None], 3, axis=2), theta=math.pi)
-            flat = light.kind in (LightKind.RECT, LightKind.DISK) and float(axes[k][:, 2] @ frame[2]) > 0.999999
-            weights, theta, share, waste = _emission(shaping, cosine=flat)
-            power[k] = share if light.kind != LightKind.DISTANT else 1.0  # whose directions lie around the axis anyway
-            best = flat or light.kind == LightKind.POINT or waste > _SPHERE_WASTE
-            if best and light.kind <= LightKind.POINT and weights.max() > 0.0:
-                blank = np.zeros((*weights.shape, 3))
-                photons = grids.add(blank, theta=theta, weights=weights, keep=False)
-        edge = math.radians(shaping.cone_angle) if shaping.cone_angle < 180.0 else 4.0  # beyond any angle there is
-        fade = edge if shaping.cone_softness == 0.0 else edge * (1.0 - shaping.cone_softness)
-        unlit, shadowless = (links.setdefault(s, len(links)) if s else -1 for s in (light.unlit, light.shadowless))
-        of_light[k] = len(rows)
-        shaped, shadows = int(light.shaping is not None), int(light.shadows)
-        tint = shaping.focus_tint
-        where = (profile, photons, *_ramp(light.shaping), shadows, unlit, shadowless)
-        rows.append((frame, shaped, fade, edge, shaping.focus, tint, *where))
+        if light.shaping is not None and light.shaping.profile is not None:
+            _check(light.name, light.shaping)
+            radiance[k] = float(light.shaping.profile.max())
+        flat = light.kind in (LightKind.RECT, LightKind.DISK) and float(axes[k][:, 2] @ _axis(light)) > _ALONG
+        of_light[k] = len(rows.rows)
+        share = rows.add(light, flat=flat, kind=light.kind, peak=max(radiance[k], 1.0e-30))
+        power[k] = share if light.kind != LightKind.DISTANT else 1.0  # whose directions lie around the axis anyway
+    of_mesh = np.full(len(meshes), -1, np.int32)
+    for k, mesh in enumerate(meshes):
+        if mesh.light is not None and needs_control(mesh.light):
+            of_mesh[k] = len(rows.rows)
+            rows.add(mesh.light, flat=_is_flat(mesh, _axis(mesh.light)))
 
-    out = ControlTables()
-    out.count = len(rows)
-    out.shaped_count = sum(light.shaping is not None for light in lights)
+    out = rows.upload(launcher)
+    out.shaped_count = sum(light.shaping is not None for light in (*lights, *(m.light for m in meshes if m.light)))
     out.of_light = launcher.array(of_light, wp.int32)
-    table = np.zeros(max(len(rows), 1), LightControl.numpy_dtype())
-    for k, row in enumerate(rows):
-        table[k] = row
-    out.rows = launcher.array(table, LightControl)
-    out.meshes = meshes
+    out.surface_count = int((of_mesh >= 0).sum())
+    out.of_mesh = launcher.array(of_mesh if out.surface_count else [-1], wp.int32)
     sampled = [k for k, x in enumerate(lights) if x.kind <= LightKind.CYLINDER and not (x.shadows and not x.shadowless)]
     out.sampled_count = len(sampled)
     out.sampled = launcher.array(sampled or [0], wp.int32)
-    bits = np.zeros((max(len(links), 1), max(meshes, 1)), np.int32)
-    for link, index in links.items():
-        bits[index, list(link)] = 1
-    out.links = launcher.array(bits.reshape(-1), wp.int32)
+    out.sampled_surfaces = sum(m.light is not None and not (m.light.shadows and not m.light.shadowless) for m in meshes)
     return out, radiance, power
+
+
+class _Rows:
+    """The rows of controls and links while they are gathered."""
+
+    def __init__(self, meshes: int, grids: GridList) -> None:
+        self.rows: list[tuple[Any, ...]] = []
+        self._meshes, self._grids = meshes, grids
+        self._links: dict[frozenset[int], int] = {}
+
+    def add(
+        self, light: Light | MeshLight, *, flat: bool, kind: LightKind = LightKind.SPHERE, peak: float = 1.0
+    ) -> float:
+        """Adds the row of one light.
+
+        Args:
+            light: Whose.
+            flat: Whether all of it faces along the axis of its shaping.
+            kind: Photons leave surfaces as they leave a sphere.
+            peak: By which a profile is divided.
+
+        Returns:
+            What shaping makes of the power, the profile being divided by its maximum.
+
+        Raises:
+            InputError: A value is not usable; the message names the light.
+        """
+        for link in (light.unlit, light.shadowless):
+            if any(not 0 <= mesh < self._meshes for mesh in link):
+                raise InputError(f"{light.name}: it is linked to meshes outside 0..{self._meshes - 1}")
+        shaping = light.shaping or Shaping()
+        _check(light.name, shaping)
+        profile, photons, share = -1, -1, 1.0
+        if light.shaping is not None:
+            if shaping.profile is not None:
+                table = np.repeat(shaping.profile[:, :, None] / peak, 3, axis=2)
+                profile = self._grids.add(table, theta=math.pi)
+            weights, theta, share, waste = _emission(shaping, cosine=flat)
+            best = flat or kind == LightKind.POINT or waste > _SPHERE_WASTE
+            if best and kind <= LightKind.POINT and weights.max() > 0.0:
+                blank = np.zeros((*weights.shape, 3))
+                photons = self._grids.add(blank, theta=theta, weights=weights, keep=False)
+        edge = math.radians(shaping.cone_angle) if shaping.cone_angle < 180.0 else 4.0  # beyond any angle there is
+        fade = edge if shaping.cone_softness == 0.0 else edge * (1.0 - shaping.cone_softness)
+        links = (self._links.setdefault(s, len(self._links)) if s else -1 for s in (light.unlit, light.shadowless))
+        where = (profile, photons, *_ramp(light.shaping), int(light.shadows), *links)
+        shaped = int(light.shaping is not None)
+        self.rows.append((_frame(light), shaped, fade, edge, shaping.focus, shaping.focus_tint, *where))
+        return share
+
+    def upload(self, launcher: Launcher) -> Any:
+        """The `ControlTables` with rows and links."""
+        out = ControlTables()
+        out.count = len(self.rows)
+        table = np.zeros(max(len(self.rows), 1), LightControl.numpy_dtype())
+        for k, row in enumerate(self.rows):
+            table[k] = row
+        out.rows = launcher.array(table, LightControl)
+        out.meshes = self._meshes
+        bits = np.zeros((max(len(self._links), 1), max(self._meshes, 1)), np.int32)
+        for link, index in self._links.items():
+            bits[index, list(link)] = 1
+        out.links = launcher.array(bits.reshape(-1), wp.int32)
+        return out
+
+
+def shaped_power(light: MeshLight, normals: Any, *, double_sided: bool) -> npt.NDArray[np.float64]:
+    """What shaping makes of the power of surfaces, roughly: for choosing them, so it is 0 for none that may emit.
+
+    Args:
+        light: Whose surfaces.
+        normals: Unit, [n, 3].
+        double_sided: Whether they emit from both sides.
+
+    Returns:
+        [n], relative to the same surfaces unshaped.
+    """
+    shaping = light.shaping
+    if shaping is None:
+        return np.ones(len(normals))
+    edge = math.radians(min(shaping.cone_angle, 180.0))
+    theta = edge * (np.arange(512) + 0.5) / 512.0
+    factor = _factor(shaping, theta).mean(axis=1) * (1.0 if shaping.profile is None else float(shaping.profile.max()))
+    # Of a surface tilted by β, the cosine at polar angle θ, integrated over the azimuth: ∫ (a + b cosφ)⁺ dφ.
+    tilt = np.linspace(0.0, math.pi, 129)
+    a, b = np.cos(theta) * np.cos(tilt)[:, None], np.sin(theta) * np.sin(tilt)[:, None]
+    half = np.arccos(np.clip(-a / np.maximum(b, 1.0e-12), -1.0, 1.0))
+    share = (2.0 * (a * half + b * np.sin(half)).clip(0.0) * factor) @ (np.sin(theta) * edge / 512.0) / math.pi
+    if double_sided:
+        share = 0.5 * (share + share[::-1])
+    angle = np.arccos(np.clip(normals @ _axis(light), -1.0, 1.0))
+    return np.asarray(np.interp(angle, tilt, np.maximum(share, _LEAST * share.max())))
+
+
+def _axis(light: Light | MeshLight) -> npt.NDArray[np.float64]:
+    """The axis of its shaping, unit."""
+    return _frame(light)[2]
+
+
+def _is_flat(mesh: Mesh, axis: npt.NDArray[np.float64]) -> bool:
+    """Whether all of a mesh emits along an axis."""
+    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    return not mesh.double_sided and bool((cross @ axis >= _ALONG * np.linalg.norm(cross, axis=1)).all())
 
 
 def _check(name: str, shaping: Shaping) -> None:
@@ -185,7 +272,7 @@ def _check(name: str, shaping: Shaping) -> None:
         raise InputError(f"{name}: a profile must not be negative")
 
 
-def _frame(light: Light) -> npt.NDArray[np.float64]:
+def _frame(light: Light | MeshLight) -> npt.NDArray[np.float64]:
     """Rows: the light's X, its Y and -Z as unit vectors of the world, at right angles whatever its scale or shear."""
     linear = light.world_from_light[:3, :3].astype(np.float64)
     axis = -linear[:, 2]

@@ -31,6 +31,10 @@ CONFORM_POLICIES = (
 """How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
 
 
+MAX_CLIPPING_PLANES = 6
+"""Of a `Camera`: as many as a box has sides."""
+
+
 class InputError(ValueError):
     """The user's input cannot be rendered; the message is one line that says what and where."""
 
@@ -104,20 +108,62 @@ class Material:
     albedo_texture: Texture | None = None
     emission_texture: Texture | None = None
     opacity_texture: Texture | None = None
+    glow: Color | None = None
+    """Radiance that the camera sees of the emitting side, where that is not `emission`, by which it lights the scene;
+    None: the same, shaped as the mesh's `MeshLight` has it."""
+    glow_texture: Texture | None = None
 
     def __post_init__(self) -> None:
         if self.albedo_texture is not None:
             object.__setattr__(self, "albedo", self.albedo_texture.mean)
         if self.emission_texture is not None:
             object.__setattr__(self, "emission", self.emission_texture.mean)
+        if self.glow_texture is not None:
+            object.__setattr__(self, "glow", self.glow_texture.mean)
         if self.opacity_texture is not None:
             object.__setattr__(self, "opacity", self.opacity_texture.mean[0])
 
     @property
     def textures(self) -> tuple[Texture, ...]:
         """Those it has."""
-        found = (self.albedo_texture, self.emission_texture, self.opacity_texture)
+        found = (self.albedo_texture, self.emission_texture, self.opacity_texture, self.glow_texture)
         return tuple(texture for texture in found if texture is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Shaping:
+    """How a light's radiance depends on the direction of emission (UsdLux ShapingAPI), θ being its angle to the axis.
+
+    The axis is the light's -Z, whatever its shape. Factors multiply.
+    """
+
+    cone_angle: float = 180.0
+    """Half angle [degrees] of the cone outside which the light is dark."""
+    cone_softness: float = 0.0
+    """Part of that angle, from 0 to 1, over which the light fades out smoothly."""
+    focus: float = 0.0
+    """Exponent of the factor |cosθ|^focus."""
+    focus_tint: Color = (0.0, 0.0, 0.0)
+    """What the focus fades to: the factor is |cosθ|^focus + (1 - |cosθ|^focus) · focus_tint."""
+    profile: Floats | None = None
+    """Photometry of a lamp, [rows, columns]: the factor at the middle of cells that divide θ from 0° to 180° and the
+    azimuth from 0° to 360°, from the light's +X towards its +Y; interpolated between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshLight:
+    """What makes a light of a mesh whose materials emit, beyond that (UsdLux MeshLightAPI)."""
+
+    name: str = ""
+    """Prim path of the light, or any label for messages."""
+    world_from_light: Floats = field(default_factory=lambda: np.eye(4))
+    """float64 [4, 4]; its -Z is the axis of the shaping."""
+    shaping: Shaping | None = None
+    """Multiplies the radiance that the materials emit; None: the same in all directions."""
+    shadows: bool = True
+    """As for `Light`, and so are the other two."""
+    unlit: frozenset[int] = frozenset()
+    shadowless: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +192,9 @@ class Mesh:
     """Texture coordinates of the triangles' corners by name, float32 [m, 3, 2]."""
     bare: npt.NDArray[np.bool_] | None = None
     """bool [m], triangles that take the colour of their instance where `Instances.colors` has one; None: none do."""
+    light: MeshLight | None = None
+    """Shaping, links and shadows of what its materials emit; None: it emits all around, lights everything, and
+    everything shadows it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,26 +209,6 @@ class Instances:
     """world_from_prototype, float64 [k, 4, 4], invertible; mirrored and sheared ones are fine."""
     colors: Floats | None = None
     """float32 [k, 3], albedo of the triangles that `Mesh.bare` selects; None: their material's."""
-
-
-@dataclass(frozen=True, eq=False)
-class Shaping:
-    """How a light's radiance depends on the direction of emission (UsdLux ShapingAPI), θ being its angle to the axis.
-
-    The axis is the light's -Z, whatever its shape. Factors multiply.
-    """
-
-    cone_angle: float = 180.0
-    """Half angle [degrees] of the cone outside which the light is dark."""
-    cone_softness: float = 0.0
-    """Part of that angle, from 0 to 1, over which the light fades out smoothly."""
-    focus: float = 0.0
-    """Exponent of the factor |cosθ|^focus."""
-    focus_tint: Color = (0.0, 0.0, 0.0)
-    """What the focus fades to: the factor is |cosθ|^focus + (1 - |cosθ|^focus) · focus_tint."""
-    profile: Floats | None = None
-    """Photometry of a lamp, [rows, columns]: the factor at the middle of cells that divide θ from 0° to 180° and the
-    azimuth from 0° to 360°, from the light's +X towards its +Y; interpolated between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +262,9 @@ class Camera:
     """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
     focus_distance: float = 1.0
     """Depth along -Z at which a camera with a lens is sharp, in scene units."""
+    clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
+    """At most `MAX_CLIPPING_PLANES` of (a, b, c, d): camera rays see only where a x + b y + c z + d >= 0, x, y, z being
+    the place in the camera's space."""
 
     @property
     def aspect(self) -> float:

@@ -326,3 +326,23 @@ def emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if hit.front == 1 or scene.emits_back[hit.triangle] == 1:
         return emitted(scene, hit.triangle, hit.u, hit.v, hit.area, footprint)
     return wp.vec3(0.0)
+
+
+@wp.func
+def has_glow(scene: SceneData, triangle: int) -> bool:
+    """Whether the camera sees something else of a triangle than the `emission` by which it lights the scene."""
+    if scene.glow_count == 0:
+        return False
+    return scene.patterns[0].glow[scene.triangle_material[triangle]][0] >= 0.0
+
+
+@wp.func
+def glow(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
+    """What it sees then."""
+    if hit.front == 0 and scene.emits_back[hit.triangle] == 0:
+        return wp.vec3(0.0)
+    material = scene.triangle_material[hit.triangle]
+    texture = scene.patterns[0].glow_texture[material]
+    if texture >= 0:
+        return _textured(scene.patterns, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
+    return scene.patterns[0].glow[material]

@@ -1,6 +1,7 @@
 """The estimators agree with each other, converge as they should, and know how wrong they are."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ import warp_ir as ir
 from tests.physics.closed_form import placed, render, rotation_x
 from tests.physics.test_invariance import room
 from warp_ir.estimators import ESTIMATORS
+from warp_ir.metrics import relative_mse
 from warp_ir.procedural import cornell_box, floor, furnace, mesh, sphere
 from warp_ir.scene import LightKind
+
+SCENES = Path(__file__).parents[2] / "scenes_usd"
 
 
 def smooth_ball():
@@ -108,3 +112,47 @@ def test_light_paths_are_of_low_discrepancy():
         for n in (64, 512)
     )
     assert many < few / 64
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_rooms", "thousand_lights", "light_types", "corridor", "emissive mesh"])
+@pytest.mark.parametrize("estimator", ["vpl", "path"])
+def test_standard_errors_of_scenes(estimator, name):
+    """The variance of repeated renders is what they say: with textures, many lights, hidden lights, emissive meshes.
+
+    Of 16 renders, whose errors within each may be as good as the same, it is known to √(2/16) = 0.35 at worst; two of
+    those above. Below, edges with their stratified jitter leave as little as half.
+    """
+    scene = cornell_box() if name == "emissive mesh" else ir.load_usd(SCENES / f"{name}.usda")
+    films = [render(scene, estimator, width=16, height=16, iterations=32, seed=k, light_paths=None) for k in range(16)]
+    pictures = np.array([film.radiance() for film in films], np.float64)
+    mean = pictures.mean(axis=0)
+    weight = 1.0 / (mean**2 + 0.01 * mean.mean() ** 2)
+    said = np.mean([weight * film.standard_error().astype(np.float64) ** 2 for film in films])
+    assert 0.3 < np.mean(weight * pictures.var(axis=0, ddof=1)) / said < 1.7
+
+
+@pytest.fixture(scope="module")
+def small_box():
+    """The Cornell box of the test scenes, settings for small pictures of it, and the mean of 1024 iterations."""
+    scene = ir.load_usd(SCENES / "cornell_box.usda")
+    common = dict(width=12, height=12, light_paths=256)
+    return scene, common, render(scene, "vpl", iterations=1024, **common).radiance()
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_target_error_is_the_true_error(filtered, small_box):
+    """A render to a target error of 5 % stops there, and its relative RMS error against the truth is 5 %, or less.
+
+    Errors within a render may be as good as the same (VPLs are shared): of 8 renders the mean square is known to
+    √(2/8) = 0.5 at worst, two of which bound it from above; the truth's own error is within that. On the many edges of
+    so small a picture jitter is stratified and the error smaller; filtered, it is smaller still.
+    """
+    scene, common, truth = small_box
+    target = 0.05
+    settings = [ir.RenderSettings(target_error=target, filter=filtered, seed=k, **common) for k in range(1, 9)]
+    films = [ir.render(scene, s) for s in settings]
+    assert all(0.8 * target < film.error() <= target for film in films)
+    error = np.mean([relative_mse(film.radiance(), truth) for film in films])
+    assert error < 2.0 * target**2
+    assert filtered or error > 0.2 * target**2

@@ -4,17 +4,26 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from warp_ir.cli.console import say_warnings
 from warp_ir.cli.stage import moment_of, open_reader, stage_facts
-from warp_ir.scene import LightKind, Scene
+from warp_ir.cost import scene_bytes
+from warp_ir.scene import Light, LightKind, Material, Mesh, MeshLight, Scene
 
-_BYTES_PER_TRIANGLE = 200
-"""On the device, beside textures; `benchmarks/scaling.py` measures it."""
+_SKIPPED = (
+    "prims_invisible",
+    "prims_other_purpose",
+    "degenerate_faces",
+    "triangles_absent",
+    "unused_materials",
+    "lights_without_emission",
+    "composition_errors",
+)
+"""Counts of what a stage has and the picture does not."""
 _LINES = 20
 """Lights, materials, ... listed by name before only their number is told; --verbose lists all."""
 
@@ -40,10 +49,10 @@ def run(args: argparse.Namespace) -> int:
 def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
     """The scene in plain values, with what only the stage itself knows, and the seconds it took to load."""
     lower, upper = scene.bounds()
-    camera = scene.camera
+    camera, cost, known = scene.camera, scene_bytes(scene), stage_facts(reader)
     return {
         "stage": str(reader.source),
-        **stage_facts(reader),
+        **known,
         "camera": {
             "name": scene.camera.name,
             "projection": scene.camera.projection.name.lower(),
@@ -57,7 +66,7 @@ def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
             "shutter_moments": len(scene.shutter),
         },
         "moving_meshes": reader.moving_meshes,
-        "cost": {"load_seconds": seconds, "scene_bytes": _BYTES_PER_TRIANGLE * scene.triangle_count},
+        "cost": {"load_seconds": seconds, "scene_bytes": sum(cost.values()), "bytes": cost},
         "meshes": len(scene.meshes),
         "triangles": scene.triangle_count,
         "triangles_seen": scene.triangles_seen,
@@ -71,16 +80,77 @@ def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
             for group in scene.instances
         ],
         "bounds": [_floats(lower), _floats(upper)],
-        "lights": [
-            {"name": light.name, "kind": light.kind.name.lower(), "radiance": _floats(light.radiance)}
-            for light in scene.lights
-        ],
-        "materials": [
-            {"name": m.name, "albedo": _floats(m.albedo), "emission": _floats(m.emission)} for m in scene.materials
-        ],
+        "lights": [_light(light) for light in scene.lights],
+        "mesh_lights": [_mesh_light(mesh, scene) for mesh in scene.meshes if mesh.light is not None],
+        "materials": [_material(material) for material in scene.materials],
         "emissive_triangles": _emissive_triangles(scene),
         "counts": {key: int(value) for key, value in scene.stats.items()},
+        "skipped": {key: int(scene.stats[key]) for key in _SKIPPED if scene.stats.get(key)},
+        "guessed": _guesses(scene, known["cameras"]),
     }
+
+
+def _light(light: Light) -> dict[str, Any]:
+    return {
+        "name": light.name,
+        "kind": light.kind.name.lower(),
+        "radiance": _floats(light.radiance),
+        "texture": None if light.texture is None else list(light.texture.shape[1::-1]),
+        **_control(light),
+    }
+
+
+def _mesh_light(mesh: Mesh, scene: Scene) -> dict[str, Any]:
+    assert mesh.light is not None
+    emission = [scene.materials[k].emission for k in np.unique(mesh.material)]
+    return {
+        "name": mesh.light.name,
+        "mesh": mesh.name,
+        "radiance": _floats(np.max(emission, axis=0)),
+        **_control(mesh.light),
+    }
+
+
+def _control(light: Light | MeshLight) -> dict[str, Any]:
+    """What is said of a light beyond its radiance and shape."""
+    shaping = light.shaping
+    return {
+        "shaping": None
+        if shaping is None
+        else {
+            "cone_angle": shaping.cone_angle,
+            "cone_softness": shaping.cone_softness,
+            "focus": shaping.focus,
+            "profile": shaping.profile is not None,
+        },
+        "shadows": light.shadows,
+        "unlit_meshes": len(light.unlit),
+        "shadowless_meshes": len(light.shadowless),
+    }
+
+
+def _material(material: Material) -> dict[str, Any]:
+    return {
+        "name": material.name,
+        "albedo": _floats(material.albedo),
+        "emission": _floats(material.emission),
+        "glow": None if material.glow is None else _floats(material.glow),
+        "opacity": material.opacity,
+        "cutoff": material.cutoff,
+        "textures": [texture.name for texture in material.textures],
+    }
+
+
+def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
+    """What the stage leaves open, and how it was decided."""
+    found = {}
+    if scene.camera.name not in cameras:
+        found["camera"] = "one that frames the scene from outside, for there is none"
+    elif any("rendered because it is the first" in line for line in scene.warnings):
+        found["camera"] = f"the first of {len(cameras)}"
+    if any(light.name == "default dome" for light in scene.lights):
+        found["light"] = "a white dome of radiance 1, for nothing emits"
+    return found
 
 
 def _floats(values: Iterable[float]) -> list[float]:
@@ -123,8 +193,13 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     )
     _row("bounds", f"({_numbers(lower)}) to ({_numbers(upper)})")
     _list("lights", _light_lines(facts), most)
+    _list("mesh lights", _mesh_light_lines(facts), most)
     _list("materials", _material_lines(facts), most)
-    _row("costs", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory to render")
+    _row(
+        "costs", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory: {_parts(cost)}"
+    )
+    _list("skipped", [f"{value} {key.replace('_', ' ')}" for key, value in facts["skipped"].items()], most)
+    _list("guessed", [f"{key}: {value}" for key, value in facts["guessed"].items()], most)
     _list("counts", [f"{value:9} {key.replace('_', ' ')}" for key, value in facts["counts"].items()], math.inf)
 
 
@@ -142,9 +217,28 @@ def _print_list(facts: dict[str, Any], what: str) -> None:
 
 def _light_lines(facts: dict[str, Any]) -> list[str]:
     return [
-        f"{light['kind']:9} {_EMITS[light['kind']]} ({_numbers(light['radiance'])})  {light['name']}"
+        f"{light['kind']:9} {_EMITS[light['kind']]} ({_numbers(light['radiance'])}){_said(light)}  {light['name']}"
         for light in facts["lights"]
     ]
+
+
+def _mesh_light_lines(facts: dict[str, Any]) -> list[str]:
+    return [f"radiance ({_numbers(x['radiance'])}){_said(x)}  {x['name']}" for x in facts["mesh_lights"]]
+
+
+def _said(light: dict[str, Any]) -> str:
+    """What there is beyond a radiance, in a few words."""
+    width, height = light.get("texture") or (0, 0)
+    words = [f"texture {width} x {height}"] if width else []
+    words += ["shaped"] if light["shaping"] else []
+    words += [] if light["shadows"] else ["no shadows"]
+    words += [f"does not light {light['unlit_meshes']} meshes"] if light["unlit_meshes"] else []
+    words += [f"passes through {light['shadowless_meshes']} meshes"] if light["shadowless_meshes"] else []
+    return "".join(f", {word}" for word in words)
+
+
+def _parts(cost: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {_bytes(size)}" for name, size in cost["bytes"].items() if size)
 
 
 def _material_lines(facts: dict[str, Any]) -> list[str]:

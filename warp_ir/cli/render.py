@@ -183,6 +183,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
         say(f"{checkpoint.path}: from here --resume goes on")
+    unseen = _unseen(scene, film)
+    if unseen and not args.quiet:
+        say_warnings(unseen)
     _summarize(job, path, film, bool(written))
     record = {
         "output": [str(file) for file in written],
@@ -200,9 +203,17 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         "loaded": dict(scene.stats),
         "kept": kept,
         "counts": dict(film.counts),
-        "warnings": list(scene.warnings),
+        "warnings": [*scene.warnings, *unseen],
     }
     return record, code
+
+
+def _unseen(scene: Any, film: Any) -> list[str]:
+    """The warning that a picture shows no geometry, where nothing has said so before."""
+    said = any("all geometry" in line or "draws no geometry" in line for line in scene.warnings)
+    if said or not film.iterations or film.aov("alpha").max() > 0.0:
+        return []
+    return [f"{scene.camera.name}: the camera sees no geometry"]
 
 
 def _kept(before: Sequence[Any], now: Sequence[Any]) -> int:

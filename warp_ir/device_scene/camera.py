@@ -6,10 +6,14 @@ import numpy as np
 import warp as wp
 
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.scene import Camera, InputError, Projection
+from warp_ir.scene import MAX_CLIPPING_PLANES, Camera, InputError, Projection
 from warp_ir.settings import RenderSettings
 
 wp.set_module_options({"enable_backward": False})
+
+
+Planes = wp.types.matrix(shape=(MAX_CLIPPING_PLANES, 4), dtype=wp.float32)
+"""A clipping plane a row: n and d of n·(p - origin) + d >= 0."""
 
 
 @wp.struct
@@ -33,6 +37,8 @@ class CameraData:
     height: float
     near: float
     far: float
+    plane_count: int  # clipping planes
+    planes: Planes
     orthographic: int
     lens_radius: float  # 0: a pinhole
     focus: float  # depth of the plane that is sharp
@@ -72,7 +78,21 @@ def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) ->
     out.width, out.height = (right - left) * unit, (top - bottom) * unit
     out.near = camera.clipping[0] * frame.scale
     out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
+    out.plane_count, out.planes = len(camera.clipping_planes), _planes(camera, frame)
     out.orthographic = int(not perspective)
     out.lens_radius, out.focus = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
     out.blurs = int(lens > 0.0)
     return out
+
+
+def _planes(camera: Camera, frame: DeviceFrame) -> Any:
+    table = np.zeros((MAX_CLIPPING_PLANES, 4))
+    if len(camera.clipping_planes) > len(table):
+        raise InputError(f"camera {camera.name!r}: has more than {len(table)} clipping planes")
+    for k, plane in enumerate(camera.clipping_planes):
+        scale = max(float(np.linalg.norm(plane[:3])), 1.0e-30)
+        table[k, :3] = camera.world_from_camera[:3, :3] @ np.array(plane[:3]) / scale
+        table[k, 3] = np.clip(plane[3] / scale * frame.scale, -1.0e30, 1.0e30)
+    if not np.isfinite(table).all():
+        raise InputError(f"camera {camera.name!r}: clipping planes must be finite")
+    return Planes(*table.ravel().tolist())

@@ -42,6 +42,8 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
             raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
         if not all(0.0 <= e < np.inf for e in material.emission):
             raise InputError(f"{material.name}: emission must be finite and not negative, is {material.emission}")
+        if material.glow is not None and not all(0.0 <= e < np.inf for e in material.glow):
+            raise InputError(f"{material.name}: glow must be finite and not negative, is {material.glow}")
     for light in scene.lights:
         if not all(0.0 <= e < np.inf for e in light.radiance):
             raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
@@ -93,6 +95,8 @@ def _check_instances(scene: Scene) -> None:
         taken.update(group.meshes)
         demand(group.matrices.shape == (count, 4, 4) and count > 0, "matrices must have shape [k, 4, 4], k > 0")
         demand(np.isfinite(group.matrices).all(), "matrices must be finite")
+        shaped = any((light := scene.meshes[k].light) is not None and light.shaping is not None for k in group.meshes)
+        demand(not shaped, "a mesh whose emission is shaped cannot be instanced: every place has an axis of its own")
         demand((group.matrices[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(), "matrices must be affine")
         if group.colors is not None:
             demand(group.colors.shape == (count, 3), "colors must have shape [k, 3], one per instance")
@@ -124,5 +128,10 @@ def _check_mesh(mesh: Mesh) -> None:
         demand(np.isfinite(corners).all(), f"uvs {name!r} must be finite")
     if mesh.bare is not None:
         demand(mesh.bare.shape == (count,) and mesh.bare.dtype == bool, "bare must have shape [m] and be of bools")
+    if mesh.light is not None:
+        matrix = mesh.light.world_from_light
+        demand(
+            matrix.shape == (4, 4) and np.isfinite(matrix).all(), "light: world_from_light must be a finite 4x4 matrix"
+        )
     if mesh.colors is not None and count:
         demand(mesh.colors.min() >= 0.0 and mesh.colors.max() <= 1.0, "colors must lie in [0, 1]")

@@ -11,6 +11,7 @@ from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.materials import LARGEST_UV
 from warp_ir.device_scene.records import _TRIANGLE_EMITTER
 from warp_ir.launch import Launcher
+from warp_ir.light_control import shaped_power
 from warp_ir.scene import Light, LightKind, Mesh, Scene
 from warp_ir.texture import mean_on_triangles
 
@@ -43,12 +44,18 @@ def upload_emitters(
         glowing = np.nonzero(emission[mesh.material] > 0.0)[0] if emission.any() else np.zeros(0, np.int64)
         if len(glowing):
             a, b, c = (mesh.points[mesh.triangles[glowing, k]] * frame.scale for k in range(3))
-            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            cross = np.cross(b - a, c - a)
+            length = np.linalg.norm(cross, axis=1)
+            area = 0.5 * length
             sides = 2.0 if mesh.double_sided else 1.0
+            power = math.pi * sides * area * _mean_emission(scene, mesh, glowing, area, data.footprint)
+            if mesh.light is not None:
+                normals = cross / np.maximum(length, 1.0e-30)[:, None]
+                power *= shaped_power(mesh.light, normals, double_sided=mesh.double_sided)
             kinds.append(np.full(len(glowing), _TRIANGLE_EMITTER, np.int32))
             items.append((first + glowing).astype(np.int32))
             areas.append(sides * area)
-            powers.append(math.pi * sides * area * _mean_emission(scene, mesh, glowing, area, data.footprint))
+            powers.append(power)
         first += len(mesh.triangles)
 
     tables = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers, areas))

@@ -33,7 +33,7 @@ def upload_lights(
     grids = GridList()
     texture, gain = _add_textures(lights, grids)
     tables = LightTables()
-    tables.controls, peak, share = upload_controls(lights, axes, len(scene.meshes), grids, launcher)
+    tables.controls, peak, share = upload_controls(lights, axes, scene.meshes, grids, launcher)
     radiance *= peak[:, None]
 
     data.light_count = len(lights)

@@ -33,6 +33,10 @@ def upload_materials(
     data.texture_count = len(textures)
     patterns = Patterns()
     patterns.textures = upload_textures(textures, uv_sets, launcher)
+    unseen = (-1.0, -1.0, -1.0)
+    patterns.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
+    patterns.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
+    data.glow_count = sum(m.glow is not None for m in materials)
     corners: list[Any] = []
     for mesh in meshes:
         sets = [mesh.uvs.get(name) for name in uv_sets]

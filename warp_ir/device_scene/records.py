@@ -18,11 +18,13 @@ _TRIANGLE_EMITTER = len(LightKind)
 
 @wp.struct
 class Patterns:
-    """The textures, and where they lie."""
+    """The textures, and where they lie; and what the camera sees of some materials."""
 
     textures: TextureTable
     triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
     corner_uvs: wp.array[wp.vec2]
+    glow: wp.array[wp.vec3]  # [materials], what the camera sees in place of the emission; negative: nothing else
+    glow_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
 
 
 @wp.struct
@@ -65,6 +67,7 @@ class SceneData:
     texture_count: int
     patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
     open_count: int  # materials whose opacity is below 1 anywhere
+    glow_count: int  # materials of which the camera sees something else than their emission
     footprint: float  # width of the patch that a reflection of light stands for
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
     radius: float  # of a sphere around the origin that holds all surfaces
@@ -85,9 +88,9 @@ class SceneData:
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
     light_emitter: wp.array[wp.int32]  # its row in the emitter tables, or -1
     textured_count: int  # lights with a texture
-    control_count: int  # lights with a control
+    control_count: int  # lights, and surfaces, with a control
     shaped_count: int  # of them with a shaping
-    only_sampled_count: int  # of them those with an area that rays are not to find
+    only_sampled_count: int  # lights with an area that rays are not to find
     light_tables: wp.array[
         LightTables
     ]  # one row: what few scenes have must not be copied with the others' at every call

@@ -1,7 +1,7 @@
 """Path tracing, the independent truth: from the eye, one path per pixel and iteration.
 
 At every vertex the lights are sampled once (next-event estimation), and the direction in which the path goes
-on may hit one as well; the two are weighted by the balance heuristic (Veach 1997). Paths end by Russian
+on may hit one as well; the two are weighted by the power heuristic (Veach 1997). Paths end by Russian
 roulette on the local albedo. It shares ray queries and scene tables with the VPLs, and no transport.
 
 Surfaces are shaded with interpolated normals where the camera sees them, and with the triangles' own
@@ -16,9 +16,9 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
 from warp_ir.launch import Launcher
-from warp_ir.lights import LightPoint, arriving, lights_found, sample_light, surface_weight
+from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sample_arrival, surface_found
 from warp_ir.settings import RenderSettings
-from warp_ir.surface import albedo, closest, emission
+from warp_ir.surface import albedo, closest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,34 +27,28 @@ _UNLIMITED = 2**31 - 1
 
 
 @wp.func
-def _light_at(
+def _reflected(
     scene: SceneData,
     position: wp.vec3,
     normal: wp.vec3,
     shading_normal: wp.vec3,
     mesh: int,
     seen: bool,
-    light: LightPoint,
+    light: Arrival,
 ) -> wp.vec3:
     """Weighted irradiance over π at a point from one sample of the lights."""
-    xyz = wp.vec3(light.position[0], light.position[1], light.position[2])
-    to_light = xyz - position * light.position[3]
-    squared = wp.dot(to_light, to_light)
-    direction = to_light / wp.sqrt(squared)
-    at_point = wp.dot(shading_normal, direction)
-    at_light = light.normal[3] - wp.dot(wp.vec3(light.normal[0], light.normal[1], light.normal[2]), direction)
-    if at_point <= 0.0 or at_light <= 0.0 or wp.dot(normal, direction) <= 0.0:
+    at_point = wp.dot(shading_normal, light.direction)
+    if at_point <= 0.0 or wp.max(light.radiance) <= 0.0 or wp.dot(normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    arrives = arriving(scene, light.control, position, mesh, seen, light.position)
+    arrives = arriving(scene, light.control, position, mesh, seen, light.target)
     if wp.max(arrives) <= 0.0:
         return wp.vec3(0.0)
-    # Densities per solid angle of the two ways to find this light; a delta light has only one (density 0).
-    by_light = light.density * squared / at_light
+    # The two ways to find this light are weighted by their densities; a delta light has only one (density 0).
     by_bsdf = at_point / wp.pi
     weight = float(1.0)
     if light.density > 0.0:
-        weight = by_light / (by_light + by_bsdf)
-    return wp.cw_mul(light.intensity, arrives) * (weight * at_point * at_light / (squared * wp.pi))
+        weight = power_heuristic(light.density, by_bsdf)
+    return wp.cw_mul(light.radiance, arrives) * (weight * by_bsdf)
 
 
 @wp.kernel
@@ -83,8 +77,9 @@ def _trace_paths(
         dimension = int(0)
         while wp.max(throughput) > 0.0:
             u = sampling.sample_1d(scene.sobol, 0, dimension, stream)
-            light = sample_light(scene, u, sampling.sample_2d(scene.sobol, 0, dimension + 1, stream))
-            lit = _light_at(scene, position, normal, shading_normal, mesh, bounce == 0, light)
+            u2 = sampling.sample_2d(scene.sobol, 0, dimension + 1, stream)
+            light = sample_arrival(scene, position, u, u2)
+            lit = _reflected(scene, position, normal, shading_normal, mesh, bounce == 0, light)
             found = wp.cw_mul(throughput, lit)
 
             # The way on: lights it meets count here, the surface it meets is the next vertex.
@@ -97,9 +92,7 @@ def _trace_paths(
                 reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
                 seen = lights_found(scene, position, direction, reach, hit.triangle < 0, density, mesh)
                 if hit.triangle >= 0:
-                    emitted = emission(scene, hit, scene.footprint)
-                    if wp.max(emitted) > 0.0:
-                        seen += emitted * surface_weight(scene, hit, direction, density)
+                    seen += surface_found(scene, hit, direction, density, mesh)
                 found += wp.cw_mul(throughput, seen)
             if bounce == 0:
                 once += found

@@ -21,9 +21,9 @@ from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gather import Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.launch import Launcher
-from warp_ir.lights import Bound, bound_on, cut_share, lights_beyond
+from warp_ir.lights import cut_share, lights_beyond, surface_beyond
 from warp_ir.settings import RenderSettings
-from warp_ir.surface import Hit, albedo, closest, emission
+from warp_ir.surface import albedo, closest
 from warp_ir.vpl import emit_vpls
 
 wp.set_module_options({"enable_backward": False})
@@ -78,18 +78,6 @@ def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
     return x
 
 
-@wp.func
-def _glow_beyond(scene: SceneData, hit: Hit, g: float, bound: Bound) -> wp.vec3:
-    """Radiance of a surface, times the share that the bound cuts of the VPLs on it."""
-    glow = emission(scene, hit, scene.footprint)
-    density = float(0.0)
-    if wp.max(glow) > 0.0:
-        emitter = scene.triangle_emitter[hit.triangle]
-        if emitter >= 0:
-            density = scene.emitter_density[emitter]
-    return glow * cut_share(bound_on(bound, density), g)
-
-
 @wp.kernel
 def _gather_pixels(
     first: int,
@@ -139,7 +127,7 @@ def _gather_pixels(
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
                 cut = cut_share(lights.bound.least, g)
                 if cut > 0.0:
-                    found += _glow_beyond(scene, hit, g, lights.bound)
+                    found += surface_beyond(scene, hit, direction, g, lights.bound, x.mesh)
             found = wp.cw_mul(throughput, found) * wp.pi
             if depth == 0:
                 once += found

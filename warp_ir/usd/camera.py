@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils, Vt
+from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils
 
-from warp_ir.scene import Camera, Floats, InputError, Projection
+from warp_ir.scene import MAX_CLIPPING_PLANES, Camera, Floats, InputError, Projection
 from warp_ir.usd import value
 from warp_ir.usd.report import Report, Unreadable
 
@@ -105,8 +105,6 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
         report.warn(prim.GetPath(), f"focusDistance is {focus:g}: no depth of field")
     elif stop > 0.0:
         lens = 0.5 * _TENTH / (unit * stop)
-    if isinstance(planes := value.raw(camera.GetClippingPlanesAttr(), time), Vt.Vec4fArray) and len(planes):
-        report.warn(prim.GetPath(), "clippingPlanes: nothing is cut away by planes of its own")
     exposure = _exposure(camera, time)
     if not (math.isfinite(exposure) and exposure >= 0.0):
         report.warn(prim.GetPath(), f"its exposure scale is {exposure:g}; 1 is used")
@@ -117,6 +115,7 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
         window=((x - half_x) * unit, (x + half_x) * unit, (y - half_y) * unit, (y + half_y) * unit),
         projection=projection,
         clipping=_clipping(camera, time, report),
+        clipping_planes=_clipping_planes(camera, time, report),
         exposure=exposure,
         lens_radius=lens,
         focus_distance=focus if lens > 0.0 else 1.0,
@@ -177,6 +176,26 @@ def _clipping(camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report) -> tup
         report.warn(camera.GetPath(), f"clippingRange {near_far} is empty; nothing is clipped")
         return 0.0, math.inf
     return max(near, 0.0), far
+
+
+def _clipping_planes(
+    camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report
+) -> tuple[tuple[float, float, float, float], ...]:
+    try:
+        planes = value.floats(camera.GetClippingPlanesAttr(), time, 4)
+    except Unreadable as trouble:
+        report.warn(camera.GetPath(), f"{trouble}; nothing is cut away")
+        return ()
+    if planes is None:
+        return ()
+    # Without a normal a plane cuts away all or nothing: that is no plane.
+    usable = np.isfinite(planes).all(axis=1) & (np.abs(planes[:, :3]).max(axis=1) > 0.0)
+    if not usable.all():
+        report.warn(camera.GetPath(), "clippingPlanes: {n} that are no planes are ignored", int((~usable).sum()))
+    planes = planes[usable]
+    if len(planes) > MAX_CLIPPING_PLANES:
+        report.warn(camera.GetPath(), f"clippingPlanes: of {len(planes)} the first {MAX_CLIPPING_PLANES} cut")
+    return tuple((a, b, c, d) for a, b, c, d in planes[:MAX_CLIPPING_PLANES].tolist())
 
 
 def _exposure(camera: UsdGeom.Camera, time: Usd.TimeCode) -> float:

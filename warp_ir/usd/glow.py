@@ -1,56 +1,117 @@
-"""Gprims that are lights (LightAPI, MeshLightAPI): their surface emits, so they become emissive materials."""
+"""Gprims that are lights (LightAPI, MeshLightAPI, GeometryLight): their surface emits as their materials then say."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from pxr import Usd, UsdLux
+from pxr import Tf, Usd, UsdGeom, UsdLux
 
-from warp_ir.scene import Floats, Material
+from warp_ir.scene import Floats, LightKind, Material, MeshLight, Shaping, Texture
 from warp_ir.usd import value
 from warp_ir.usd.inputs import Inputs
-from warp_ir.usd.light import as_color, emission, warn_of_unread
-from warp_ir.usd.linking import is_linked
+from warp_ir.usd.light import as_color, emission, light_texture, warn_of_unread
 from warp_ir.usd.report import Report, Unreadable
+from warp_ir.usd.shaping import read_shaping
+
+LAMP_UV = "st"
+"""The primvar that places a light's texture on a gprim."""
+_BLACK = (0.0, 0.0, 0.0)
 
 
-def glow(prim: Usd.Prim, materials: list[Material], area: float, time: Usd.TimeCode, report: Report) -> list[Material]:
-    """The materials of a gprim with LightAPI, with what the light adds to them.
+class Lamp:
+    """A light whose shape is a gprim, read once, to be put in many places.
 
-    light:materialSyncMode decides: `materialGlowTintsLight` multiplies the light with the material's own emission
-    (if it has any: else the light emits alone), `noMaterialResponse` leaves a black emitter, `independent` has a
-    glow for the eye and another for the light, which surfaces here cannot tell apart: the light's is used.
+    light:materialSyncMode decides what the gprim's materials have to do with it: `materialGlowTintsLight` multiplies
+    the light with the material's own emission (if it has any: else the light emits alone), `independent` shows the
+    camera the material's emission and lights the scene with the light's, `noMaterialResponse` leaves a black emitter.
 
     Args:
-        prim: The gprim.
-        materials: Its materials.
-        area: Of one copy in the world, for `normalize`.
+        prim: The light: the gprim itself, or a GeometryLight that refers to it.
+        gprim: Whose surface it is.
         time: Of the values.
         report: Where troubles go.
     """
-    inputs = Inputs(prim, time, report)
-    try:
-        radiance = emission(inputs)
-        if inputs.flag("normalize") and area > 0.0:
+
+    def __init__(self, prim: Usd.Prim, gprim: Usd.Prim, time: Usd.TimeCode, report: Report) -> None:
+        self._prim, self._on_its_own = prim, prim == gprim
+        self._time, self._report = time, report
+        self._radiance: Floats | None = None
+        """None: it does not emit as a light."""
+        self._shaping: Shaping | None = None
+        self._shadows, self._normalize = True, False
+        self._mode = value.text(prim.GetAttribute("light:materialSyncMode"), time, "noMaterialResponse")
+        inputs = Inputs(prim, time, report)
+        try:
+            self._normalize = inputs.flag("normalize")
+            self._shaping = read_shaping(inputs, LightKind.SPHERE)
+            self._shadows = not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True)
+            warn_of_unread(inputs)
+            self._radiance = emission(inputs)
+        except Unreadable as trouble:
+            report.warn(prim.GetPath(), f"{trouble}; it does not emit as a light")
+        pixels = light_texture(inputs, LightKind.RECT)
+        self._texture = None if pixels is None else Texture("texture:file", pixels, uv=LAMP_UV)
+        if self._radiance is not None and self._radiance.max() == 0.0:
+            report.stats["lights_without_emission"] += 1
+
+    @property
+    def textured(self) -> bool:
+        """Whether it wants the gprim's texture coordinates `LAMP_UV`."""
+        return self._texture is not None
+
+    def differs(self, areas: Floats) -> bool:
+        """Whether places in which the gprim has these areas [k] have to be told apart."""
+        alike = np.allclose(areas, areas[:1], rtol=1e-5)
+        return self._radiance is not None and (self._shaping is not None or (self._normalize and not alike))
+
+    def light(self, world_from_gprim: Floats) -> MeshLight | None:
+        """What it is beyond its emission, in one of its places; None if it does not emit as a light."""
+        if self._radiance is None:
+            return None
+        matrix = world_from_gprim
+        if not self._on_its_own:
+            try:
+                matrix = np.array(UsdGeom.XformCache(self._time).GetLocalToWorldTransform(self._prim)).T
+            except Tf.ErrorException:
+                self._report.warn(self._prim.GetPath(), "its transform cannot be read; the identity is used")
+                matrix = np.eye(4)
+        if not np.isfinite(matrix).all():
+            matrix = np.eye(4)
+        return MeshLight(str(self._prim.GetPath()), matrix, self._shaping, self._shadows)
+
+    def materials(self, materials: Sequence[Material], area: float) -> list[Material]:
+        """The gprim's materials with what the light adds to them.
+
+        Args:
+            materials: What it has without.
+            area: Of one copy in the world, for `normalize`.
+        """
+        radiance = self._radiance
+        if radiance is not None and self._normalize and area > 0.0:
             radiance = radiance / area
-        as_color(radiance)
-        _warn_of_unread(inputs)
-    except Unreadable as trouble:
-        report.warn(prim.GetPath(), f"{trouble}; it does not emit as a light")
-        return materials
-    if radiance.max() == 0.0:
-        report.stats["lights_without_emission"] += 1
-    mode = value.text(prim.GetAttribute("light:materialSyncMode"), time, "noMaterialResponse")
-    if mode == "independent":
-        inputs.warn("materialSyncMode 'independent': the material's own glow is not shown, only the light's")
-    lit = []
-    for material in materials:
-        material = replace(material, name=str(prim.GetPath()))
-        if mode == "noMaterialResponse":
-            material = replace(material, albedo=(0.0, 0.0, 0.0), albedo_texture=None)
-        if mode != "materialGlowTintsLight" or max(material.emission) == 0.0:
-            material = replace(material, emission=(1.0, 1.0, 1.0), emission_texture=None)
-        lit.append(_times(material, radiance))
-    return lit
+        try:
+            tint = None if radiance is None else as_color(radiance)
+        except Unreadable as trouble:
+            self._report.warn(self._prim.GetPath(), f"{trouble}; it does not emit as a light")
+            tint = None
+        if tint is None or radiance is None:
+            return list(materials)
+        lit = []
+        for material in materials:
+            material = replace(material, name=str(self._prim.GetPath()))
+            if self._mode == "noMaterialResponse":
+                material = replace(material, albedo=_BLACK, albedo_texture=None)
+            elif self._mode == "independent":
+                material = replace(material, glow=material.emission, glow_texture=material.emission_texture)
+            if self._mode != "materialGlowTintsLight" or max(material.emission) == 0.0:
+                material = replace(material, emission=(1.0, 1.0, 1.0), emission_texture=None)
+            if self._texture is not None and material.emission_texture is None:
+                material = _times(replace(material, emission_texture=self._texture), np.array(material.emission))
+            elif self._texture is not None:
+                what = "texture:file: not read, for the material's own emission has a texture"
+                self._report.warn(self._prim.GetPath(), what)
+            lit.append(_times(material, radiance))
+        return lit
 
 
 def _times(material: Material, factor: Floats) -> Material:
@@ -62,17 +123,3 @@ def _times(material: Material, factor: Floats) -> Material:
     red, green, blue = (factor * texture.outside).tolist()
     pixels = np.asarray(texture.pixels, np.float32) * factor.astype(np.float32)
     return replace(material, emission_texture=replace(texture, pixels=pixels, outside=(red, green, blue)))
-
-
-def _warn_of_unread(inputs: Inputs) -> None:
-    """What analytic lights have and surfaces do not."""
-    warn_of_unread(inputs)
-    prim = inputs.prim
-    if prim.HasAPI(UsdLux.ShapingAPI):
-        inputs.warn("a surface that emits is not shaped: it emits in all directions")
-    if prim.HasAPI(UsdLux.ShadowAPI) and not inputs.flag("shadow:enable", True):
-        inputs.warn("inputs:shadow:enable = false is not read for a surface that emits: it casts shadows")
-    if is_linked(prim):
-        inputs.warn("links of a surface that emits are not read: it lights everything")
-    if inputs.asset("texture:file") is not None:
-        inputs.warn("only rectangles and domes have textures; this one is ignored")

@@ -6,19 +6,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdLux
 
+from warp_ir.placing import areas_of_copies
 from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
 from warp_ir.usd import value
-from warp_ir.usd.glow import glow
+from warp_ir.usd.glow import LAMP_UV, Lamp
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.instancing import combined, combined_colors
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.network import Images
+from warp_ir.usd.primvar import texture_coordinates
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
 from warp_ir.usd.sharing import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share
 from warp_ir.usd.skel import Skinning, sharing_key
-from warp_ir.usd.walk import Site
+from warp_ir.usd.walk import LIGHT_COPIES, Site
 
 _Shapes = dict[tuple[Sdf.Path, ...], Shape | None]
 
@@ -89,6 +91,7 @@ class _Builder:
         self._shapes = shapes
         self._seen: dict[tuple[object, ...], tuple[Shape, Look, bool]] = {}
         self._known: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
+        self._lamps: dict[Sdf.Path, Lamp] = {}
 
     def run(self, sites: Sequence[Site]) -> Geometry:
         self._table.resolve([site.prim for site in sites])
@@ -101,7 +104,8 @@ class _Builder:
             places = combined(level.matrices for level in drawn.levels)
             colors = combined_colors((len(level.matrices), level.colors) for level in drawn.levels)
             if home is None:
-                self._add(meshes, self._mesh(gprim, places, colors))
+                for chosen in self._apart(gprim, places):
+                    self._add(meshes, self._mesh(gprim, places[chosen], None if colors is None else colors[chosen]))
                 continue
             if id(home) not in prototypes:
                 prototypes[id(home)] = self._prototype(home, gprim)
@@ -140,6 +144,10 @@ class _Builder:
         if whole is None:
             return None
         look = self._table.look(site.prim, whole)
+        lamp = self._lamp(site)
+        if lamp is not None and lamp.textured and LAMP_UV not in look.uvs:
+            corners = texture_coordinates(site.prim, whole, LAMP_UV, self._time, self._report)
+            look = look if corners is None else replace(look, uvs={**look.uvs, LAMP_UV: corners})
         uvs = tuple((name, digest(corners)) for name, corners in sorted(look.uvs.items()))
         key = (id(whole), digest(look.material), digest(look.colors), digest(look.bare), uvs)
         if key not in self._seen:
@@ -153,8 +161,30 @@ class _Builder:
         self._report.stats["triangles_absent"] += absent * site.level.total
         if len(shape.triangles) == 0:
             return None
-        lamp = site.lamp is not None or site.prim.HasAPI(UsdLux.LightAPI)
-        return _Gprim(site, shape, look, emits or lamp)
+        return _Gprim(site, shape, look, emits or lamp is not None)
+
+    def _lamp(self, site: Site) -> Lamp | None:
+        """The light that a gprim is, if it is one."""
+        prim = site.prim if site.prim.HasAPI(UsdLux.LightAPI) else site.lamp
+        if prim is None:
+            return None
+        path = site.prim.GetPath()
+        if path not in self._lamps:
+            self._lamps[path] = Lamp(prim, site.prim, self._time, self._report)
+        return self._lamps[path]
+
+    def _apart(self, gprim: _Gprim, places: Floats) -> list[slice]:
+        """The places that one mesh can stand for: all, unless they differ as lights."""
+        lamp = self._lamp(gprim.site)
+        if lamp is None or len(places) == 1:
+            return [slice(None)]
+        areas = areas_of_copies(gprim.shape.points, gprim.shape.triangles, places @ gprim.site.local)
+        if not lamp.differs(areas):
+            return [slice(None)]
+        if len(places) > LIGHT_COPIES:
+            self._report.warn(gprim.site.prim.GetPath(), f"{len(places)} copies of a light: too many, it is left out")
+            return []
+        return [slice(k, k + 1) for k in range(len(places))]
 
     @staticmethod
     def _signature(gprim: _Gprim) -> object:
@@ -244,17 +274,18 @@ class _Builder:
             bare = None if bare is None else bare[kept.face]
         if len(triangles) == 0:
             return None
-        lamp = prim if prim.HasAPI(UsdLux.LightAPI) else gprim.site.lamp
+        lamp, light = self._lamp(gprim.site), None
         if lamp is not None:
+            light = lamp.light(matrices[0])
             used, material = np.unique(material, return_inverse=True)
             area = 0.5 * float(np.linalg.norm(cross_products(points, triangles), axis=1).sum()) / copies
-            lit = glow(lamp, [self._table.materials[i] for i in used], area, self._time, self._report)
+            lit = lamp.materials([self._table.materials[i] for i in used], area)
             material = np.array([self._table.add(m) for m in lit], dtype=np.int32)[material]
             if not any(max(m.albedo) > 0.0 for m in lit):
                 colors = None  # a light that answers with no material reflects no colour either
         # Of the implicit shapes only the plane is double-sided unless it says otherwise; its schema knows.
         double_sided = value.flag(prim.GetAttribute("doubleSided"), self._time)
-        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare)
+        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare, light)
 
     def _placed(self, shape: Shape, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
         """Copies of a shape; the same arrays for prototypes of the same geometry, which then share their tree."""

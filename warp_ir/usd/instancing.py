@@ -9,6 +9,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import value
+from warp_ir.usd.carry import carried_points, turned
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask
 
@@ -86,7 +87,8 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[I
     """
     instancer = UsdGeom.PointInstancer(prim)
     indices = value.ints(instancer.GetProtoIndicesAttr(), time)
-    positions = value.floats(instancer.GetPositionsAttr(), time, 3)
+    moving = instancer.GetPositionsAttr(), instancer.GetVelocitiesAttr(), instancer.GetAccelerationsAttr()
+    positions = carried_points(*moving, time, report)
     prototypes = instancer.GetPrototypesRel().GetForwardedTargets()
     if indices is None or len(indices) == 0:
         return []
@@ -95,12 +97,13 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[I
         raise Unreadable(f"it has {len(indices)} protoIndices but {found} positions")
     count = len(indices)
     scales = _optional(instancer.GetScalesAttr(), time, 3, count, prim, report)
-    turns = _optional(instancer.GetOrientationsfAttr(), time, 4, count, prim, report)
-    if turns is None:
-        turns = _optional(instancer.GetOrientationsAttr(), time, 4, count, prim, report)
     matrices = np.tile(np.eye(4), (count, 1, 1))
-    if turns is not None:
-        matrices[:, :3, :3] = _rotations(turns)
+    for attribute in (instancer.GetOrientationsfAttr(), instancer.GetOrientationsAttr()):
+        moment, spin = turned(attribute, instancer.GetAngularVelocitiesAttr(), time, count, report)
+        turns = _optional(attribute, moment, 4, count, prim, report)
+        if turns is not None:
+            matrices[:, :3, :3] = _rotations(turns) if spin is None else _spins(spin) @ _rotations(turns)
+            break
     if scales is not None:
         matrices[:, :3, :3] *= scales[:, None, :]
     matrices[:, :3, 3] = positions
@@ -149,6 +152,13 @@ def _rotations(quaternions: Floats) -> Floats:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return np.array(rows).transpose(2, 0, 1)
+
+
+def _spins(vectors: Floats) -> Floats:
+    """Matrices [k, 3, 3] of rotation vectors [k, 3]: their direction the axis, their length the angle [rad]."""
+    angle = np.linalg.norm(vectors, axis=1, keepdims=True)
+    axis = vectors / np.where(angle > 0.0, angle, 1.0)
+    return _rotations(np.concatenate([axis * np.sin(0.5 * angle), np.cos(0.5 * angle)], axis=1))
 
 
 def _mask(instancer: UsdGeom.PointInstancer, count: int, time: Usd.TimeCode, report: Report) -> Mask:

@@ -15,6 +15,7 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd import value
+from warp_ir.usd.dome import LAYOUTS, to_latlong
 from warp_ir.usd.inputs import Inputs
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shaping import read_shaping
@@ -86,7 +87,7 @@ def read_light(
         str(prim.GetPath()),
         kind,
         as_color(radiance),
-        texture=_texture(inputs, kind),
+        texture=light_texture(inputs, kind),
         shaping=read_shaping(inputs, kind),
         shadows=not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True),
     )
@@ -173,7 +174,7 @@ class _Placing:
         )
 
 
-def _texture(inputs: Inputs, kind: LightKind) -> Floats | None:
+def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     """The image that multiplies a light's radiance, float32 [h, w, 3], as `Light` wants it."""
     asset = inputs.asset("texture:file")
     if asset is None:
@@ -182,16 +183,16 @@ def _texture(inputs: Inputs, kind: LightKind) -> Floats | None:
         inputs.warn("only rectangles and domes have textures; this one is ignored")
         return None
     layout = inputs.text("texture:format", "automatic") if kind == LightKind.DOME else "latlong"
-    if layout not in ("automatic", "latlong"):
-        inputs.warn(f"dome textures of the format '{layout}' are not read: it emits its constant colour")
-        return None
+    if layout not in ("automatic", "latlong", *LAYOUTS):
+        inputs.warn(f"texture:format: '{layout}' is no layout; read as latlong")
     space = inputs.attribute("texture:file").GetColorSpace()
     try:
         image = read_texture(asset, space if space in ("raw", "sRGB") else "auto", _TEXELS[kind])
+        pixels = to_latlong(image.rgb, layout) if layout in LAYOUTS else image.rgb
     except Unreadable as trouble:
         inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
         return None
-    return np.clip(image.rgb, 0.0, _BRIGHTEST_TEXEL)
+    return np.clip(pixels, 0.0, _BRIGHTEST_TEXEL)
 
 
 def _dome_from_pole(inputs: Inputs) -> Floats:

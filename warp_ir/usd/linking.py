@@ -3,15 +3,24 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from pxr import Sdf, Usd, UsdLux
 
-from warp_ir.scene import Light, Mesh
+from warp_ir.scene import Light, Mesh, MeshLight
 from warp_ir.usd import value
 
+_Links = tuple[frozenset[int], frozenset[int]]
+"""Unlit and shadowless meshes."""
 
-def link(stage: Usd.Stage, lights: Sequence[Light], meshes: Sequence[Mesh]) -> tuple[Light, ...]:
-    """The lights with their links to the meshes of a scene, both of them named by their prims' paths.
+# A mesh that does not move is the same object at all times, linked or not.
+_LINKED: WeakKeyDictionary[Mesh, Mesh] = WeakKeyDictionary()
+
+
+def link(
+    stage: Usd.Stage, lights: Sequence[Light], meshes: Sequence[Mesh]
+) -> tuple[tuple[Light, ...], tuple[Mesh, ...]]:
+    """The lights, and the meshes that are lights, with their links to the meshes of a scene, all named by their paths.
 
     Args:
         stage: Where the lights are.
@@ -19,23 +28,32 @@ def link(stage: Usd.Stage, lights: Sequence[Light], meshes: Sequence[Mesh]) -> t
         meshes: Of the scene, in its order.
     """
     known: dict[Any, frozenset[int]] = {}
+
+    def links(light: Light | MeshLight) -> _Links:
+        prim = stage.GetPrimAtPath(light.name) if Sdf.Path.IsValidPathString(light.name) else None
+        if not prim:
+            return frozenset(), frozenset()
+        api = UsdLux.LightAPI(prim)
+        unlit = _outside(api.GetLightLinkCollectionAPI(), meshes, known)
+        return unlit, _outside(api.GetShadowLinkCollectionAPI(), meshes, known)
+
     linked = []
     for light in lights:
-        prim = stage.GetPrimAtPath(light.name) if Sdf.Path.IsValidPathString(light.name) else None
-        if prim:
-            api = UsdLux.LightAPI(prim)
-            unlit = _outside(api.GetLightLinkCollectionAPI(), meshes, known)
-            shadowless = _outside(api.GetShadowLinkCollectionAPI(), meshes, known)
-            if unlit or shadowless:
-                light = replace(light, unlit=unlit, shadowless=shadowless)
-        linked.append(light)
-    return tuple(linked)
+        unlit, shadowless = links(light)
+        linked.append(replace(light, unlit=unlit, shadowless=shadowless) if unlit or shadowless else light)
+    return tuple(linked), tuple(mesh if mesh.light is None else _with_links(mesh, links(mesh.light)) for mesh in meshes)
 
 
-def is_linked(prim: Usd.Prim) -> bool:
-    """Whether a light has a link that is not to everything."""
-    api = UsdLux.LightAPI(prim)
-    return any(_says(c) for c in (api.GetLightLinkCollectionAPI(), api.GetShadowLinkCollectionAPI()))
+def _with_links(mesh: Mesh, links: _Links) -> Mesh:
+    """The mesh with the links of its light; the same object for the same."""
+    assert mesh.light is not None
+    if links == (mesh.light.unlit, mesh.light.shadowless):
+        return mesh
+    known = _LINKED.get(mesh)
+    if known is None or known.light is None or links != (known.light.unlit, known.light.shadowless):
+        known = replace(mesh, light=replace(mesh.light, unlit=links[0], shadowless=links[1]))
+        _LINKED[mesh] = known
+    return known
 
 
 def _says(collection: Usd.CollectionAPI) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from pxr import Tf, Usd
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
+from warp_ir.usd.black import explain_blackness, explain_dark_lights
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import Geometry, build_meshes
 from warp_ir.usd.light import LIGHTS, read_light
@@ -249,9 +250,13 @@ class StageReader:
         if not meshes:
             hint = "; it has proxies (purposes)" if report.stats["prims_proxy"] else ""
             report.warn("/", f"the stage draws no geometry{hint}")
-        if not lights and not any(max(m.emission) > 0.0 for m in materials) and self._default_light == "dome":
-            report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
-            lights = (_DOME,)
+        if not lights and not any(max(m.emission) > 0.0 for m in materials):
+            dark = [site.prim for site in (*still.lamps, *still.moving.lights)]
+            dark += [self.stage.GetPrimAtPath(mesh.light.name) for mesh in meshes if mesh.light is not None]
+            explain_dark_lights(dark, time, report)
+            if self._default_light == "dome":
+                report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
+                lights = (_DOME,)
         stats = dict.fromkeys(_COUNTED, 0) | report.stats
         stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
         textures = {texture for material in materials for texture in material.textures}
@@ -260,14 +265,16 @@ class StageReader:
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
         stats["prototypes"] = len(geometry.instances)
         stats["prototype_places"] = sum(len(group.matrices) for group in geometry.instances)
-        lights = link(self.stage, lights, meshes)
+        lights, meshes = link(self.stage, lights, meshes)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
         if view is None:
             along = "-Z" if self._axis == "Y" else "+Y"
             report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
             view = framing_camera(*scene.bounds(), self._axis)
-        return replace(scene, camera=view, warnings=report.lines(), stats=stats)
+        scene = replace(scene, camera=view, stats=stats)
+        explain_blackness(scene, report)
+        return replace(scene, warnings=report.lines())
 
     def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
         """What is drawn, and where; what stays the same at all times is read the first time."""
@@ -276,7 +283,8 @@ class StageReader:
         moving, staying = Found(), Found()
         for name in ("shapes", "lights"):
             for site in getattr(found, name):
-                getattr(moving if self._motion.moves(site.prim) else staying, name).append(site)
+                moves = self._motion.moves(site.prim) or (site.lamp is not None and self._motion.moves(site.lamp))
+                getattr(moving if moves else staying, name).append(site)
         if self._still is None or key != self._still.key:
             read = self._opened.part()
             geometry = build_meshes(staying.shapes, time, read, self._levels, images=self._images, metals=self._metals)
@@ -285,7 +293,7 @@ class StageReader:
         else:
             read, geometry, lights = self._still.read, self._still.geometry, self._still.lights
         report.include(read)
-        return _Still(key, moving, geometry, lights, read, report)
+        return _Still(key, moving, geometry, lights, tuple(staying.lights), read, report)
 
     def _with_moving(self, still: Geometry, sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> Geometry:
         """All geometry: what stays, what only changes its place, whose shape is read once, and what changes itself."""
@@ -309,6 +317,8 @@ class _Still:
     """What has to be read each time."""
     geometry: Geometry
     lights: tuple[Light, ...]
+    lamps: tuple[Site, ...]
+    """The lights that stay, those too that emit nothing."""
     read: Report
     """Of the geometry and the lights that stay."""
     report: Report

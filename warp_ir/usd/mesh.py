@@ -7,6 +7,7 @@ from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import primvar, value
+from warp_ir.usd.carry import carried_points
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, elements_of, shaded, without_slivers
 from warp_ir.usd.skel import Pose, Skinning
@@ -32,7 +33,7 @@ def read_mesh(
         InputError: Subdivision would make more triangles than can be held.
     """
     mesh = UsdGeom.Mesh(prim)
-    points = _points(mesh, time, report)
+    points = carried_points(*_carrying(mesh), time, report)
     counts = value.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = value.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
@@ -77,7 +78,7 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points = _points(tets, time, report)
+    points = carried_points(*_carrying(tets), time, report)
     faces = value.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
     if points is not None and (faces is None or len(faces) == 0):
         cells = value.ints(tets.GetTetVertexIndicesAttr(), time, 4)
@@ -97,50 +98,8 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Shape |
     return _finished(prim, shape, int(keep.sum()), time, report)
 
 
-def _points(shape: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> Floats | None:
-    """The points [n, 3]: where velocities carry them from the sample before, else interpolated by USD.
-
-    Velocities make sense of a cache whose topology changes from sample to sample, where nothing can be interpolated.
-    """
-    attribute, velocities = shape.GetPointsAttr(), shape.GetVelocitiesAttr()
-    points = value.floats(attribute, time, 3)
-    if points is None or time.IsDefault() or not velocities.HasAuthoredValue():
-        return points
-    bracket = _bracket(attribute, time)
-    if bracket is None or bracket[0] == time.GetValue():
-        return points
-    seconds: float = (time.GetValue() - bracket[0]) / shape.GetPrim().GetStage().GetTimeCodesPerSecond()
-    try:
-        moved = value.floats(attribute, Usd.TimeCode(bracket[0]), 3)
-        if moved is None or _bracket(velocities, time) != bracket:
-            return points
-        velocity = _rates(velocities, bracket[0], len(moved))
-        if _bracket(shape.GetAccelerationsAttr(), time) == bracket:
-            velocity = velocity + 0.5 * seconds * _rates(shape.GetAccelerationsAttr(), bracket[0], len(moved))
-    except Unreadable as trouble:
-        report.warn(shape.GetPath(), f"{trouble}; the points are interpolated instead")
-        return points
-    carried: Floats = moved + seconds * velocity
-    return carried
-
-
-def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
-    """The velocities or accelerations [count, 3] of the points of a sample."""
-    rates = value.floats(attribute, Usd.TimeCode(sample), 3)
-    if rates is None or len(rates) != count:
-        raise Unreadable(f"{attribute.GetName()} has {0 if rates is None else len(rates)} values for {count} points")
-    if not np.isfinite(rates).all():
-        raise Unreadable(f"{attribute.GetName()} has values that are NaN or infinite")
-    return rates
-
-
-def _bracket(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
-    """The times of the samples before and after a moment; None without samples.
-
-    Velocities go with points only if both have the same: that is how USD knows that they were made together.
-    """
-    samples = attribute.GetBracketingTimeSamples(time.GetValue()) if attribute else ()
-    return (samples[0], samples[1]) if samples else None
+def _carrying(shape: UsdGeom.PointBased) -> tuple[Usd.Attribute, Usd.Attribute, Usd.Attribute]:
+    return shape.GetPointsAttr(), shape.GetVelocitiesAttr(), shape.GetAccelerationsAttr()
 
 
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:

@@ -49,7 +49,9 @@ def open_stage(
             does not exist.
     """
     for text in mask:
-        if not (Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsAbsoluteRootOrPrimPath()):
+        path_of_mask = Sdf.Path(text) if Sdf.Path.IsValidPathString(text) else Sdf.Path()
+        # A relative path of a prim is an IsAbsoluteRootOrPrimPath as well.
+        if not (path_of_mask.IsAbsolutePath() and path_of_mask.IsAbsoluteRootOrPrimPath()):
             raise InputError(f"mask: {text!r} is not the absolute path of a prim")
     root = _layer(path)
     # One of our own, so that selecting variants changes nothing that another stage shares.
@@ -59,7 +61,7 @@ def open_stage(
         session.subLayerPaths.append(stronger.identifier)
     try:
         if mask:
-            paths = [text for text in needed if Sdf.Path.IsValidPathString(text)]
+            paths = [text for text in needed if Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsPrimPath()]
             stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask([*mask, *paths]))
             stage.ExpandPopulationMask()
         else:

@@ -16,7 +16,7 @@ from warp_ir.usd.report import Report, Unreadable
 
 _DEPTH = 16
 """Deepest nesting of point instancers that is followed."""
-_LIGHT_COPIES = 100_000
+LIGHT_COPIES = 100_000
 """Most copies of one light."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
@@ -123,6 +123,8 @@ class _Walk:
         elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
             if self._is_drawn(prim, name):
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
+        elif kind == "RenderPass":
+            report.warn(prim.GetPath(), "render passes are not read: all is drawn, in one picture")
         elif kind in ("LightFilter", "PluginLightFilter"):
             report.warn(prim.GetPath(), "light filters are not read")
         elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
@@ -167,7 +169,7 @@ class _Walk:
         return True
 
     def _add_light(self, site: Site) -> None:
-        if site.level.total > _LIGHT_COPIES:
+        if site.level.total > LIGHT_COPIES:
             self._report.warn(site.prim.GetPath(), f"{site.level.total} copies of a light: too many, it is left out")
         else:
             self._found.lights.append(site)

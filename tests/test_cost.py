@@ -1,0 +1,146 @@
+"""What a scene will cost, against what it takes."""
+
+import gc
+import json
+import weakref
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+from tests.physics.closed_form import placed
+from tests.physics.test_light_control import DOWN, everything, lamp_profile
+from warp_ir.cli import main
+from warp_ir.cost import scene_bytes
+from warp_ir.device_scene import upload_moments
+from warp_ir.launch import Launcher
+from warp_ir.procedural import cornell_box, furnace, mesh, sphere
+from warp_ir.scene import LightKind, Shaping
+
+
+class Counting(Launcher):
+    """Remembers every array that is made."""
+
+    def __init__(self):
+        super().__init__("cpu")
+        self._made = []
+
+    def _seen(self, array):
+        self._made.append(weakref.ref(array))
+        return array
+
+    def empty(self, *args):
+        return self._seen(super().empty(*args))
+
+    def zeros(self, *args):
+        return self._seen(super().zeros(*args))
+
+    def array(self, *args):
+        return self._seen(super().array(*args))
+
+    def alive(self):
+        gc.collect()
+        return sum(array.capacity for made in self._made if (array := made()) is not None)
+
+
+def textured():
+    rng = np.random.default_rng(0)
+    points, triangles = sphere(1.0, level=4)
+    ball = mesh("ball", points, triangles)
+    corners = points[triangles].astype(np.float32)
+    uvs = {"st": corners[..., :2].copy(), "unused": corners[..., :2].copy()}
+    ball = ir.Mesh("ball", ball.points, ball.triangles, ball.material, normals=corners, uvs=uvs)
+    images = [ir.Texture(f"t{k}", rng.random((64 << k, 100, 3)).astype(np.float32)) for k in range(3)]
+    materials = tuple(ir.Material(t.name, albedo_texture=t, emission_texture=t) for t in images)
+    return ir.Scene((ball,), materials)
+
+
+def instanced(*, emission=0.0, count=3000):
+    points, triangles = sphere(1.0, level=3)
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    matrices[:, 0, 3] = 3.0 * np.arange(count)
+    balls = [mesh(name, points, triangles) for name in ("a", "b")]
+    groups = tuple(ir.Instances(ball.name, (k,), matrices + k) for k, ball in enumerate(balls))
+    for group in groups:
+        group.matrices[:, 3] = (0.0, 0.0, 0.0, 1.0)
+    return ir.Scene(tuple(balls), (ir.Material("m", (0.5,) * 3, (emission,) * 3),), instances=groups)
+
+
+def lamps():
+    spot = Shaping(cone_angle=20.0)
+    photometry = Shaping(profile=lamp_profile(720, 360))
+    sky = np.ones((256, 512, 3), np.float32)
+    lights = [ir.Light("l", LightKind.DISK, (1.0,) * 3, placed(DOWN, (k, 2, 0)), shaping=spot) for k in range(20)]
+    lights += [
+        ir.Light("p", LightKind.POINT, (1.0,) * 3, placed(DOWN, (0, k, 0)), shaping=photometry) for k in range(2)
+    ]
+    return ir.Scene(
+        cornell_box().meshes, cornell_box().materials, (*lights, ir.Light("s", LightKind.DOME, (1,) * 3, texture=sky))
+    )
+
+
+def moving():
+    points, triangles = sphere(1.0, level=4)
+    still = mesh("still", points, triangles)
+    moments = tuple(ir.Scene((still, mesh("moves", points + k, triangles))) for k in range(4))
+    return ir.Scene(moments[0].meshes, shutter=moments)
+
+
+SCENES = {
+    "cornell box": cornell_box,
+    "furnace": lambda: furnace(level=5),
+    "many lights": lambda: ir.Scene(
+        lights=tuple(ir.Light("l", LightKind.SPHERE, (1.0,) * 3, placed(np.eye(3), (k, 0, 0))) for k in range(2000))
+    ),
+    "textures": textured,
+    "instances": instanced,
+    "instances that emit": lambda: instanced(emission=1.0, count=20),
+    "lamps": lamps,
+    "everything": everything,
+    "moments": moving,
+}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_the_estimate_is_good_to_a_fifth(scene):
+    """The bytes that are said are those of all arrays of the uploaded scene, within 20 %."""
+    scene = scene()
+    launcher = Counting()
+    uploaded = upload_moments(scene.shutter or (scene,), launcher)
+    assert sum(scene_bytes(scene).values()) == pytest.approx(launcher.alive(), rel=0.2)
+    del uploaded
+
+
+LAMP = """#usda 1.0
+def Sphere "S" (prepend apiSchemas = ["LightAPI", "ShapingAPI", "ShadowAPI"]) {
+    float inputs:shaping:cone:angle = 20
+    bool inputs:shadow:enable = false
+    rel collection:lightLink:excludes = [</T>]
+}
+def Sphere "T" {
+}
+def Sphere "Hidden" {
+    token visibility = "invisible"
+}
+"""
+
+
+def test_info_tells_what_is_skipped_and_guessed(tmp_path, capsys):
+    """The table and --json name what the stage leaves open, what is left out, and what lights are told to do."""
+    file = tmp_path / "a.usda"
+    file.write_text(LAMP)
+    assert main(["info", str(file), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["skipped"] == {"prims_invisible": 1} and list(facts["guessed"]) == ["camera"]
+    (lamp,) = facts["mesh_lights"]
+    assert lamp["name"] == "/S" and lamp["shaping"]["cone_angle"] == 20.0
+    assert lamp["unlit_meshes"] == 1 and not lamp["shadows"] and lamp["radiance"] == [1.0, 1.0, 1.0]
+    assert facts["cost"]["scene_bytes"] == sum(facts["cost"]["bytes"].values())
+    assert main(["info", str(file)]) == 0
+    table = capsys.readouterr().out
+    assert "1 prims invisible" in table and "camera: one that frames" in table
+    assert "shaped, no shadows, does not light 1 meshes  /S" in table
+    file.write_text('#usda 1.0\ndef Sphere "T" {\n}\ndef Camera "A" {\n}\ndef Camera "B" {\n}\n')
+    assert main(["info", str(file), "--json"]) == 0
+    guessed = json.loads(capsys.readouterr().out)["guessed"]
+    assert guessed["camera"] == "the first of 2" and "white dome" in guessed["light"]

@@ -1,0 +1,30 @@
+"""Emitters: points on them, photons from them, rays that find them. Emissive triangles and UsdLux lights are one list.
+
+`shape.py` is one light, `arriving.py` what of it gets to a point.
+"""
+
+from warp_ir.lights.arriving import arriving
+from warp_ir.lights.beyond import Bound, bound_on, cut_share, lights_beyond, surface_beyond
+from warp_ir.lights.found import lights_found, surface_found, surface_seen
+from warp_ir.lights.next_event import Arrival, power_heuristic, sample_arrival
+from warp_ir.lights.photons import emit, land
+from warp_ir.lights.points import LightPoint, sample_light
+
+__all__ = [
+    "Arrival",
+    "Bound",
+    "LightPoint",
+    "arriving",
+    "bound_on",
+    "cut_share",
+    "emit",
+    "land",
+    "lights_beyond",
+    "lights_found",
+    "power_heuristic",
+    "sample_arrival",
+    "sample_light",
+    "surface_beyond",
+    "surface_found",
+    "surface_seen",
+]

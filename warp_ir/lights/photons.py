@@ -1,0 +1,102 @@
+"""Photons: how they leave a light, and where they land that not every mesh stops."""
+
+import warp as wp
+
+from warp_ir import sampling
+from warp_ir.device_scene import SceneData
+from warp_ir.grid import cell_direction, sample_cell
+from warp_ir.light_control import linked, shaping_factor
+from warp_ir.lights.arriving import CROSSINGS, behind
+from warp_ir.lights.points import LightPoint
+from warp_ir.surface import Hit, closest
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Emission:
+    """A photon that leaves a light."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    flux: wp.vec3  # [W]
+
+
+@wp.func
+def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emission:
+    """A photon from a point on an emitter: `u` gives its direction, `v` the place of one from far away."""
+    out = Emission()
+    xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
+    if point.position[3] == 0.0:
+        # Parallel light enters through a disk that covers the scene, seen from there.
+        d = sampling.to_disk(v)
+        out.origin = scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
+        out.direction = -xyz
+        out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
+    elif point.normal[3] == 1.0:
+        out.origin = xyz
+        out.direction = sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
+        out.flux = point.intensity * (4.0 * wp.pi)
+    else:
+        out.origin = xyz
+        out.direction = sampling.to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
+        out.flux = point.intensity * wp.pi
+    if point.control >= 0:
+        out = _shaped(scene, point, u, out)
+    return out
+
+
+@wp.func(inline=False)
+def _shaped(scene: SceneData, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
+    """The photon of a light with a control: in a direction that suits the shaping, or with the factor as a weight."""
+    control = scene.light_tables[0].controls.rows[point.control]
+    photon = unshaped
+    if control.photons >= 0:
+        local = cell_direction(
+            scene.light_tables[0].grids, control.photons, sample_cell(scene.light_tables[0].grids, control.photons, u)
+        )
+        photon.direction = wp.transpose(control.frame) * wp.vec3(local[0], local[1], local[2])
+        n = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
+        cosine = wp.max(0.0, point.normal[3] + wp.dot(n, photon.direction))
+        photon.flux = point.intensity * (cosine / local[3])
+    photon.flux = wp.cw_mul(photon.flux, shaping_factor(control, scene.light_tables[0].grids, photon.direction))
+    return photon
+
+
+@wp.struct
+class Landing:
+    """Where a photon is reflected first."""
+
+    hit: Hit
+    weight: float  # of its flux; 0: it is lost
+
+
+@wp.func(inline=False)
+def land(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+    """The surface that reflects a photon, whose light may pass through some meshes and not light others.
+
+    Meshes it passes through are lit all the same, if they are linked: a coin decides, and doubles the flux.
+    """
+    out = Landing()
+    out.weight = 1.0
+    out.hit = first
+    control = scene.light_tables[0].controls.rows[row]
+    coin = u
+    for _ in range(CROSSINGS):
+        if out.hit.triangle < 0:
+            return out
+        mesh = scene.triangle_mesh[out.hit.triangle]
+        lit = not linked(scene.light_tables[0].controls, control.unlit, mesh)
+        if not linked(scene.light_tables[0].controls, control.shadowless, mesh):
+            if not lit:
+                out.weight = 0.0
+            return out
+        if lit:
+            out.weight = 2.0 * out.weight
+            coin = 2.0 * coin
+            if coin < 1.0:
+                return out
+            coin -= 1.0
+        out.hit = closest(scene, behind(scene, out.hit, direction), direction, 3.0e38)
+    out.weight = 0.0
+    return out

@@ -1,0 +1,205 @@
+"""Random points on emitters: emissive triangles and the lights of UsdLux are one list.
+
+A point on an emitter is homogeneous, position (x, y, z, w): w = 1 for a place, w = 0 for the direction
+towards a distant light. Its normal (x, y, z, a) gives the emitter's cosine as max(0, a + n·ω): a = 0 for a
+surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gathers light needs a second case.
+"""
+
+import warp as wp
+
+from warp_ir import sampling
+from warp_ir.device_scene import _TRIANGLE_EMITTER, SceneData
+from warp_ir.grid import cell_direction, cell_place, sample_cell, value_along, value_at_place
+from warp_ir.lights.arriving import only_sampled
+from warp_ir.lights.shape import (
+    area_scale,
+    control_of,
+    control_of_surface,
+    lift,
+    light_axis,
+    texture_of,
+    unit_area,
+    world_from_dome,
+)
+from warp_ir.scene import LightKind
+from warp_ir.surface import emitted, offset, presence
+
+wp.set_module_options({"enable_backward": False})
+
+_DISK = wp.constant(int(LightKind.DISK))
+_SPHERE = wp.constant(int(LightKind.SPHERE))
+_CYLINDER = wp.constant(int(LightKind.CYLINDER))
+_POINT = wp.constant(int(LightKind.POINT))
+_DISTANT = wp.constant(int(LightKind.DISTANT))
+_TRIANGLE = wp.constant(_TRIANGLE_EMITTER)
+
+
+@wp.struct
+class LightPoint:
+    """A random point on a random emitter."""
+
+    position: wp.vec4
+    normal: wp.vec4
+    intensity: wp.vec3  # radiance / density: W/sr for a place, W/m² for a direction
+    density: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
+    emitter: int
+    control: int  # row of its `LightControl`; -1: it has none
+
+
+@wp.struct
+class Choice:
+    """A random emitter."""
+
+    emitter: int
+    probability: float
+    rest: float  # uniform in [0, 1) again, for what is left to choose
+
+
+@wp.func
+def choose_emitter(scene: SceneData, u: float) -> Choice:
+    """An emitter in proportion to power."""
+    low = int(0)
+    high = scene.emitter_count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if scene.emitter_cdf[middle] <= u:
+            low = middle
+        else:
+            high = middle
+    out = Choice()
+    out.emitter = low
+    out.probability = scene.emitter_cdf[low + 1] - scene.emitter_cdf[low]
+    out.rest = (u - scene.emitter_cdf[low]) / out.probability
+    return out
+
+
+@wp.func
+def sample_emitter(scene: SceneData, choice: Choice, u: wp.vec2) -> LightPoint:
+    """A point on an emitter, uniformly."""
+    item = scene.emitter_item[choice.emitter]
+    kind = scene.emitter_kind[choice.emitter]
+    out = LightPoint()
+    if kind == _TRIANGLE:
+        out = _sample_triangle(scene, item, choice.probability, choice.rest, u)
+    elif kind <= _CYLINDER:
+        out = _sample_shape(scene, item, choice.probability, u)
+    else:
+        out = _sample_point_or_direction(scene, item, choice.probability, u)
+    out.emitter = choice.emitter
+    return out
+
+
+@wp.func
+def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
+    """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
+    choice = choose_emitter(scene, u_pick)
+    return sample_emitter(scene, choice, u)
+
+
+@wp.func
+def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: float, u: wp.vec2) -> LightPoint:
+    a = scene.points[scene.indices[3 * triangle]]
+    b = scene.points[scene.indices[3 * triangle + 1]]
+    c = scene.points[scene.indices[3 * triangle + 2]]
+    cross = wp.cross(b - a, c - a)
+    n = wp.normalize(cross)
+    sides = float(1.0)
+    if scene.emits_back[triangle] == 1:
+        sides = 2.0
+        n = wp.where(rest < 0.5, n, -n)
+    root = wp.sqrt(u[0])
+    at_a = 1.0 - root
+    at_b = root * (1.0 - u[1])
+    p = offset(a, b, c, at_a, at_b, n)
+    area = 0.5 * wp.length(cross)
+    out = LightPoint()
+    out.density = probability / (area * sides)
+    out.position = wp.vec4(p[0], p[1], p[2], 1.0)
+    out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
+    radiance = emitted(scene, triangle, at_a, at_b, area, scene.footprint)
+    if scene.open_count > 0:
+        radiance = radiance * presence(scene, triangle, at_a, at_b)
+    out.intensity = radiance / out.density
+    out.control = control_of_surface(scene, triangle)
+    if only_sampled(scene, out.control):
+        out.density = 0.0
+    return out
+
+
+@wp.func
+def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) -> LightPoint:
+    kind = scene.light_kind[light]
+    n = wp.vec3(0.0, 0.0, 1.0)
+    q = wp.vec3(u[0] - 0.5, u[1] - 0.5, 0.0)
+    radiance = scene.light_radiance[light]
+    relative = float(1.0)
+    texture = texture_of(scene, light)
+    if texture >= 0:
+        cell = sample_cell(scene.light_tables[0].grids, texture, u)
+        place = cell_place(scene.light_tables[0].grids, texture, cell)
+        grid = scene.light_tables[0].grids.grids[texture]
+        relative = cell.probability * float(grid.rows) * float(grid.columns)
+        radiance = wp.cw_mul(radiance, value_at_place(scene.light_tables[0].grids, texture, place))
+        q = wp.vec3(0.5 - place[0], 0.5 - place[1], 0.0)
+    if kind == _DISK:
+        d = sampling.to_disk(u)
+        q = wp.vec3(d[0], d[1], 0.0)
+    elif kind == _SPHERE:
+        n = sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
+        q = n
+    elif kind == _CYLINDER:
+        phi = 2.0 * wp.pi * u[1]
+        n = wp.vec3(0.0, wp.cos(phi), wp.sin(phi))
+        q = wp.vec3(u[0] - 0.5, n[1], n[2])
+    p = scene.light_origin[light] + scene.light_axes[light] * q
+    world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
+    out = LightPoint()
+    out.density = probability * relative / (unit_area(kind) * area_scale(scene, light, n))
+    p = lift(p, world_n)
+    out.position = wp.vec4(p[0], p[1], p[2], 1.0)
+    out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
+    out.intensity = radiance / out.density
+    out.control = control_of(scene, light)
+    if only_sampled(scene, out.control):
+        out.density = 0.0
+    return out
+
+
+@wp.func
+def _sample_point_or_direction(scene: SceneData, light: int, probability: float, u: wp.vec2) -> LightPoint:
+    kind = scene.light_kind[light]
+    out = LightPoint()
+    out.control = control_of(scene, light)
+    found = float(1.0)
+    if only_sampled(scene, out.control):
+        found = 0.0
+    out.normal = wp.vec4(0.0, 0.0, 0.0, 1.0)
+    if kind == _POINT:
+        p = scene.light_origin[light]
+        out.position = wp.vec4(p[0], p[1], p[2], 1.0)
+        out.intensity = scene.light_radiance[light] / probability
+        return out
+    texture = texture_of(scene, light)
+    if texture >= 0:
+        cell = sample_cell(scene.light_tables[0].grids, texture, u)
+        local = cell_direction(scene.light_tables[0].grids, texture, cell)
+        xyz = wp.vec3(local[0], local[1], local[2])
+        d = world_from_dome(scene, light, xyz)
+        out.position = wp.vec4(d[0], d[1], d[2], 0.0)
+        out.density = probability * local[3]
+        radiance = wp.cw_mul(scene.light_radiance[light], value_along(scene.light_tables[0].grids, texture, xyz))
+        out.intensity = radiance / out.density
+        out.density *= found
+        return out
+    cone = float(2.0)
+    if kind == _DISTANT:
+        cone = scene.light_angle[light]
+    d = sampling.to_cone(u, cone, light_axis(scene, light))
+    out.position = wp.vec4(d[0], d[1], d[2], 0.0)
+    if cone > 0.0:
+        out.density = probability / (2.0 * wp.pi * cone)
+        out.intensity = scene.light_radiance[light] / out.density
+        out.density *= found
+    else:
+        out.intensity = scene.light_radiance[light] / probability
+    return out

@@ -1,0 +1,139 @@
+"""One light: where a ray meets it, how large it is, and its radiance there, before shaping and shadows."""
+
+import warp as wp
+
+from warp_ir.device_scene import SceneData
+from warp_ir.grid import value_at_place
+from warp_ir.scene import LightKind
+
+wp.set_module_options({"enable_backward": False})
+
+_RECT = wp.constant(int(LightKind.RECT))
+_DISK = wp.constant(int(LightKind.DISK))
+_SPHERE = wp.constant(int(LightKind.SPHERE))
+_CYLINDER = wp.constant(int(LightKind.CYLINDER))
+_EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
+
+
+@wp.func
+def texture_of(scene: SceneData, light: int) -> int:
+    """The grid that multiplies a light's radiance, or -1."""
+    if scene.textured_count == 0:
+        return -1
+    return scene.light_tables[0].texture[light]
+
+
+@wp.func
+def control_of(scene: SceneData, light: int) -> int:
+    """The row of a light's control, or -1; light -1 is a surface."""
+    if scene.control_count == 0 or light < 0:
+        return -1
+    return scene.light_tables[0].controls.of_light[light]
+
+
+@wp.func
+def control_of_surface(scene: SceneData, triangle: int) -> int:
+    """The row of the control of an emissive surface, or -1."""
+    if scene.control_count == 0:
+        return -1
+    if scene.light_tables[0].controls.surface_count == 0:
+        return -1
+    return scene.light_tables[0].controls.of_mesh[scene.triangle_mesh[triangle]]
+
+
+@wp.func
+def area_scale(scene: SceneData, light: int, n: wp.vec3) -> float:
+    """Area of a shape's surface over that of the unit shape, where the unit shape's normal is `n` (Nanson)."""
+    return wp.abs(wp.determinant(scene.light_axes[light])) * wp.length(wp.transpose(scene.light_inverse[light]) * n)
+
+
+@wp.func
+def unit_area(kind: int) -> float:
+    """Area of a unit shape."""
+    if kind == _RECT:
+        return 1.0
+    if kind == _DISK:
+        return wp.pi
+    if kind == _SPHERE:
+        return 4.0 * wp.pi
+    return 2.0 * wp.pi
+
+
+@wp.func
+def light_axis(scene: SceneData, light: int) -> wp.vec3:
+    """The unit direction towards a distant light; along the normal of a flat one."""
+    m = scene.light_axes[light]
+    return wp.vec3(m[0, 2], m[1, 2], m[2, 2])
+
+
+@wp.func
+def dome_from_world(scene: SceneData, light: int, direction: wp.vec3) -> wp.vec3:
+    """A direction of the world where a dome's texture has its pole along +z and begins at +x."""
+    d = wp.transpose(scene.light_axes[light]) * direction
+    return wp.vec3(-d[2], d[0], d[1])
+
+
+@wp.func
+def world_from_dome(scene: SceneData, light: int, d: wp.vec3) -> wp.vec3:
+    """The inverse of `dome_from_world`."""
+    return scene.light_axes[light] * wp.vec3(d[1], d[2], -d[0])
+
+
+@wp.func
+def hit_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec4:
+    """Where a ray meets the emitting side of a light: the unit shape's normal there, and t (-1: it does not)."""
+    kind = scene.light_kind[light]
+    o = scene.light_inverse[light] * (origin - scene.light_origin[light])
+    d = scene.light_inverse[light] * direction
+    miss = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    if kind == _RECT or kind == _DISK:
+        if d[2] >= 0.0 or o[2] <= 0.0:
+            return miss
+        t = -o[2] / d[2]
+        x = o[0] + t * d[0]
+        y = o[1] + t * d[1]
+        if kind == _RECT and (wp.abs(x) > 0.5 or wp.abs(y) > 0.5):
+            return miss
+        if kind == _DISK and x * x + y * y > 1.0:
+            return miss
+        return wp.vec4(0.0, 0.0, 1.0, t)
+    flat = wp.where(kind == _CYLINDER, 0.0, 1.0)
+    o2 = wp.vec3(o[0] * flat, o[1], o[2])
+    d2 = wp.vec3(d[0] * flat, d[1], d[2])
+    a = wp.dot(d2, d2)
+    b = wp.dot(o2, d2)
+    if b >= 0.0 or a == 0.0:
+        return miss
+    # The squared distance of the line from the axis, computed so that a far origin does not cancel it.
+    nearest = o2 - d2 * (b / a)
+    h = 1.0 - wp.dot(nearest, nearest)
+    if h <= 0.0:
+        return miss
+    t = -b / a - wp.sqrt(h / a)  # the first of the two: the other is seen from inside
+    if t <= 0.0 or (kind == _CYLINDER and wp.abs(o[0] + t * d[0]) > 0.5):
+        return miss
+    n = wp.normalize(o2 + t * d2)
+    return wp.vec4(n[0], n[1], n[2], t)
+
+
+@wp.func
+def face_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
+    """Radiance of a light with an area where a ray meets it, before shaping."""
+    texture = texture_of(scene, light)
+    if texture < 0:
+        return scene.light_radiance[light]
+    place = texture_place(scene, light, origin, direction, t)
+    return wp.cw_mul(scene.light_radiance[light], value_at_place(scene.light_tables[0].grids, texture, place))
+
+
+@wp.func
+def texture_place(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
+    """Place in [0, 1]² on the texture of a rectangle that a ray meets at t: from +X to -X, from +Y to -Y."""
+    q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
+    return wp.vec2(0.5 - q[0], 0.5 - q[1])
+
+
+@wp.func
+def lift(p: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """A place on a light, moved by 8 ulp along a unit direction: a light often lies in the ceiling's plane."""
+    return p + direction * (wp.max(wp.abs(p)) * _EIGHT_ULP)
