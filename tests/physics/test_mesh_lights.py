@@ -198,6 +198,24 @@ def test_glow_is_for_the_eye_alone(estimator):
     np.testing.assert_array_equal(render(up, estimator, max_bounces=0, iterations=1).radiance()[..., 1:], 0.0)
 
 
+@pytest.mark.parametrize("estimator", ["vpl", "path"])
+@pytest.mark.parametrize("shadows", [True, False])
+def test_panels_close_by(shadows, estimator):
+    """L F under the middle of a square 25 times as wide as it is high above: what the bound on G takes is given back.
+
+    It takes most of the light here. The camera looks from between the floor and the panel.
+    """
+    height = 0.02
+    lamp = ir.Light(
+        "l", LightKind.RECT, (3.0,) * 3, placed(DOWN, (0, height, 0)), width=1.0, height=1.0, shadows=shadows
+    )
+    scene = with_panel(floor(lamp), lamp)
+    scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, clipping=(1.0 - 0.5 * height, 2.0)))
+    x = (0.5 / height) / math.hypot(1.0, 0.5 / height)
+    film = render(scene, estimator, max_bounces=0, light_paths=1024)
+    assert_mean(film, 3.0 * 4.0 / math.pi * x * math.atan(x), bias=1.0e-3)
+
+
 def glowing_room():
     """A room that only surfaces light, with all that can be asked of them; one of them stands in a corner."""
     points, triangles = sphere(0.5, level=2)
