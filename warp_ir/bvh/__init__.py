@@ -8,9 +8,10 @@ What is seen in many places is stored once: a second tree, over the boxes of its
 hierarchy of the prototype, in whose space they go on.
 """
 
-from warp_ir.bvh.build import build_bvh, build_bvhs, build_instance_tree
+from warp_ir.bvh.build import build_instance_tree
 from warp_ir.bvh.lanes import _on_cuda
 from warp_ir.bvh.layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.trees import Trees
 from warp_ir.bvh.walk import intersect, intersect_instances
 
 __all__ = [
@@ -18,10 +19,9 @@ __all__ = [
     "Instance",
     "InstanceTree",
     "RayHit",
+    "Trees",
     "TwoLevel",
     "_on_cuda",
-    "build_bvh",
-    "build_bvhs",
     "build_instance_tree",
     "intersect",
     "intersect_instances",

@@ -56,6 +56,7 @@ def _fill_blocks(
     points: wp.array[wp.vec3],
     indices: wp.array[wp.int32],
     first_block: wp.array[wp.int32],
+    shift: int,
     bvh: Bvh,
 ) -> None:
     """Writes a leaf's triangles side by side; lanes left over hold a triangle that no ray meets."""
@@ -76,7 +77,7 @@ def _fill_blocks(
                     p = points[indices[3 * triangle + corner]]
                 for axis in range(3):
                     bvh.blocks[9 * block + 3 * corner + axis][lane] = p[axis]
-            bvh.triangles[block][lane] = triangle
+            bvh.triangles[block][lane] = wp.where(triangle >= 0, triangle + shift, -1)
         begin += LANES
         bvh.chained[block] = wp.where(begin < end, 1, 0)
         block += 1
@@ -156,52 +157,6 @@ def _number(
     level.children[i] = children
 
 
-def build_bvh(points: Any, indices: Any, launcher: Launcher) -> tuple[Any, Any]:
-    """A `Bvh` over the triangles of the world alone, and the object that owns it; see `build_bvhs`."""
-    bvh, _, owner = build_bvhs([(points, indices)], launcher)
-    return bvh, owner
-
-
-def build_bvhs(parts: Sequence[tuple[Any, Any]], launcher: Launcher) -> tuple[Any, list[int], Any]:
-    """A `Bvh` over the triangles of the world and of prototypes.
-
-    Args:
-        parts: points, vec3 [n], and indices, int32 [3 m], on the launcher's device; m at least 1, indices within 0
-            and n - 1. First those of the world, then those of each prototype, in its own space.
-        launcher: Where the rays will run.
-
-    Returns:
-        The `Bvh`; of each prototype the `Instance.root`; the object that owns what the `Bvh` refers to by id.
-    """
-    bvh = Bvh()
-    if launcher.device.is_cuda:
-        meshes = [wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=2) for points, indices in parts]
-        bvh.mesh = meshes[0].id
-        bvh.prototypes = launcher.array([mesh.id for mesh in meshes[1:]] or [0], wp.uint64)
-        for name, dtype in (("nodes", vec8), ("children", vec8i), ("blocks", vec8), ("triangles", vec8i)):
-            setattr(bvh, name, launcher.zeros(1, dtype))
-        bvh.chained = launcher.zeros(1, wp.int32)
-        return bvh, list(range(len(parts) - 1)), meshes
-    bvh.prototypes = launcher.zeros(1, wp.uint64)
-    tables, roots, node, block = [], [], 0, 0
-    for points, indices in parts:
-        mesh = wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=_LEAF_SIZE)
-        table = _widen(mesh, node, block, launcher)
-        tables.append(table)
-        roots.append(node)
-        node += table.children.shape[0]
-        block += table.chained.shape[0]
-    for name, dtype in (
-        ("nodes", vec8),
-        ("children", vec8i),
-        ("blocks", vec8),
-        ("triangles", vec8i),
-        ("chained", wp.int32),
-    ):
-        setattr(bvh, name, _concatenated([getattr(table, name) for table in tables], dtype, launcher))
-    return bvh, roots[1:], None
-
-
 def build_instance_tree(lower: Any, upper: Any, instances: Any, launcher: Launcher) -> tuple[Any, Any]:
     """An `InstanceTree`, and the object that owns it.
 
@@ -227,26 +182,47 @@ def build_instance_tree(lower: Any, upper: Any, instances: Any, launcher: Launch
     return out, None
 
 
-def _widen(mesh: Any, node_base: int, block_base: int, launcher: Launcher) -> Any:
-    """The tables of a mesh from Warp's tree, their nodes and blocks numbered from the given ones on."""
-    located = launcher.zeros(1, wp.uint64)
-    launcher.launch(_locate, 1, [mesh.id, located])
-    tree = int(located.numpy()[0])
+def build_tree(points: Any, indices: Any, shift: int, first_node: int, first_block: int, launcher: Launcher) -> Any:
+    """The tables of one tree as a `Bvh`, in which nothing else is set; its first node is its root.
+
+    Args:
+        points: vec3 [n], on the launcher's device.
+        indices: int32 [3 m], m at least 1, within 0 and n - 1.
+        shift: Is added to the numbers of the triangles.
+        first_node: The number of the first node.
+        first_block: That of the first block.
+        launcher: Runs it.
+    """
+    mesh = wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=_LEAF_SIZE)
+    tree = tree_address(mesh, launcher)
     ends, blocks = _count(tree, LANES, launcher)
     bvh = Bvh()
     bvh.blocks = launcher.empty(9 * blocks, vec8)
     bvh.triangles = launcher.empty(blocks, vec8i)
     bvh.chained = launcher.empty(blocks, wp.int32)
-    launcher.launch(_fill_blocks, ends.shape[0] - 1, [tree, mesh.points, mesh.indices, ends, bvh])
-    bvh.nodes, bvh.children = _wide_nodes(tree, ends, node_base, block_base, launcher)
+    launcher.launch(_fill_blocks, ends.shape[0] - 1, [tree, mesh.points, mesh.indices, ends, shift, bvh])
+    bvh.nodes, bvh.children = _wide_nodes(tree, ends, first_node, first_block, launcher)
     return bvh
+
+
+def tree_address(mesh: Any, launcher: Launcher) -> int:
+    """Where Warp's tree over a mesh lies."""
+    located = launcher.zeros(1, wp.uint64)
+    launcher.launch(_locate, 1, [mesh.id, located])
+    return int(located.numpy()[0])
+
+
+def tree_size(tree: int, launcher: Launcher) -> tuple[int, int]:
+    """The root of Warp's tree, and the number of its nodes."""
+    about = launcher.zeros(2, wp.int32)
+    launcher.launch(_describe, 1, [tree, about])
+    root, nodes = about.numpy().tolist()
+    return root, nodes
 
 
 def _count(tree: int, lanes: int, launcher: Launcher) -> tuple[Any, int]:
     """The first block of each node of Warp's tree, if it is a leaf, in blocks of so many lanes; and their number."""
-    about = launcher.zeros(2, wp.int32)
-    launcher.launch(_describe, 1, [tree, about])
-    nodes = int(about.numpy()[1])
+    _, nodes = tree_size(tree, launcher)
     counts, ends = launcher.zeros(nodes, wp.int32), launcher.zeros(nodes + 1, wp.int32)
     launcher.launch(_count_blocks, nodes, [tree, lanes, counts])
     wp.utils.array_scan(counts, ends[1:], inclusive=True)
@@ -255,10 +231,8 @@ def _count(tree: int, lanes: int, launcher: Launcher) -> tuple[Any, int]:
 
 def _wide_nodes(tree: int, first_block: Any, node_base: int, block_base: int, launcher: Launcher) -> tuple[Any, Any]:
     """Nodes and children of the wide tree, level by level."""
-    about = launcher.zeros(2, wp.int32)
-    launcher.launch(_describe, 1, [tree, about])
     levels, base = [], node_base
-    sources = launcher.array(about.numpy()[:1], wp.int32)
+    sources = launcher.array([tree_size(tree, launcher)[0]], wp.int32)
     while sources.shape[0] > 0:
         size = sources.shape[0]
         base += size
@@ -270,11 +244,12 @@ def _wide_nodes(tree: int, first_block: Any, node_base: int, block_base: int, la
         sources = launcher.empty(int(inner_ends.numpy()[-1]), wp.int32)
         launcher.launch(_number, size, [level, inner_ends, inner, base, sources])
         levels.append(level)
-    nodes = _concatenated([level.nodes for level in levels], vec8, launcher)
-    return nodes, _concatenated([level.children for level in levels], vec8i, launcher)
+    nodes = concatenated([level.nodes for level in levels], vec8, launcher)
+    return nodes, concatenated([level.children for level in levels], vec8i, launcher)
 
 
-def _concatenated(arrays: Sequence[Any], dtype: Any, launcher: Launcher) -> Any:
+def concatenated(arrays: Sequence[Any], dtype: Any, launcher: Launcher) -> Any:
+    """One array of several."""
     if len(arrays) == 1:
         return arrays[0]
     out = launcher.empty(sum(array.shape[0] for array in arrays), dtype)

@@ -179,7 +179,21 @@ _through_prototype = _hierarchy("through_prototype", True)
 @wp.func
 def intersect(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool) -> RayHit:
     """The nearest triangle of the world along a ray before t_max; with `any_hit` some, without its coordinates."""
-    return _through_world(bvh, bvh.mesh, 0, origin, direction, t_max, any_hit, wp.vec3(0.0))
+    if _on_cuda():
+        hit = RayHit()
+        hit.triangle = -1
+        hit.instance = -1
+        hit.t = t_max
+        for k in range(bvh.world_count):
+            tree = bvh.meshes[bvh.root + k]
+            found = _through_world(bvh, tree.mesh, 0, origin, direction, hit.t, any_hit, wp.vec3(0.0))
+            if found.triangle >= 0:
+                found.triangle += tree.shift
+                hit = found
+                if any_hit:
+                    return hit
+        return hit
+    return _through_world(bvh, wp.uint64(0), bvh.root, origin, direction, t_max, any_hit, wp.vec3(0.0))
 
 
 @wp.func
@@ -197,9 +211,9 @@ def _enter_instance(
 ) -> RayHit:
     """The nearest triangle of one instance; the ray keeps its parameter t in the prototype's space."""
     instance = tree.instances[number]
-    mesh = bvh.mesh
+    mesh = wp.uint64(0)
     if _on_cuda():
-        mesh = bvh.prototypes[instance.root]
+        mesh = bvh.meshes[instance.root].mesh
     from_centre = origin - instance.centre
     o = instance.inverse * from_centre
     d = instance.inverse * direction
