@@ -1,4 +1,7 @@
-"""A small tree over the boxes of whole trees, so that each of them can change by itself."""
+"""A small tree over the boxes of whole trees, so that each of them can change by itself.
+
+Two levels of nodes are room for 64 trees; the walk's stack counts on it.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,11 +18,12 @@ def build_top(
     """Nodes float32 [6 k, 8] and children int32 [k, 8] of a wide tree, numbered from `first_node` on, the root first.
 
     Args:
-        lower: Lower corners [n, 3] of the boxes, n at least 2.
+        lower: Lower corners [n, 3] of the boxes, 2 to 64.
         upper: Upper corners.
         roots: What becomes the child where a box is: n nodes.
         first_node: Number of the first node.
     """
+    assert len(lower) <= _WIDTH**2
     nodes: list[npt.NDArray[np.float32]] = []
     children: list[npt.NDArray[np.int32]] = []
 

@@ -14,8 +14,9 @@ from warp_ir.bvh.layout import Bvh, InstanceTree, RayHit, TwoLevel
 wp.set_module_options({"enable_backward": False})
 
 _ULP = wp.constant(2.0**-23)
-# Warp's builders stop at depth 31, and a node leaves at most seven children behind on the stack.
-_STACK = wp.constant(224)
+# Warp's builders stop at depth 31, there are two levels above its trees, and a node leaves at most seven children
+# behind on the stack.
+_STACK = wp.constant(33 * 7 + 1)
 
 
 def _hierarchy(name: str, loose: bool) -> Any:
