@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.bvh.lanes import _on_cuda, below, enter, first_lane, meet, meet_loosely, reciprocal
-from warp_ir.bvh.layout import Bvh, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.layout import Bvh, InstanceTree, RayHit, TwoLevel, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,6 +17,32 @@ _ULP = wp.constant(2.0**-23)
 # Warp's builders stop at depth 31, there are two levels above its trees, and a node leaves at most seven children
 # behind on the stack.
 _STACK = wp.constant(33 * 7 + 1)
+
+
+@wp.func
+def _push(
+    todo: wp.array[wp.int32],
+    todo_t: wp.array[wp.float32],
+    bottom: int,
+    t: vec8,
+    t_max: float,
+    children: vec8i,
+) -> int:
+    """Puts the children that a ray enters before t_max on the stack, so that the nearest comes off first."""
+    depth = bottom
+    mask = below(t, t_max)
+    while mask != 0:
+        lane = first_lane(mask)
+        mask = mask & (mask - 1)
+        place = depth
+        while place > bottom and todo_t[place - 1] < t[lane]:
+            todo_t[place] = todo_t[place - 1]
+            todo[place] = todo[place - 1]
+            place -= 1
+        todo_t[place] = t[lane]
+        todo[place] = children[lane]
+        depth += 1
+    return depth
 
 
 def _hierarchy(name: str, loose: bool) -> Any:
@@ -139,21 +165,7 @@ def _hierarchy(name: str, loose: bool) -> Any:
                     behind,
                     inverse,
                 )
-                mask = below(t, hit.t)
-                children = bvh.children[node]
-                bottom = depth
-                while mask != 0:
-                    lane = first_lane(mask)
-                    mask = mask & (mask - 1)
-                    # Sorted in, so that the nearest comes off first.
-                    place = depth
-                    while place > bottom and todo_t[place - 1] < t[lane]:
-                        todo_t[place] = todo_t[place - 1]
-                        todo[place] = todo[place - 1]
-                        place -= 1
-                    todo_t[place] = t[lane]
-                    todo[place] = children[lane]
-                    depth += 1
+                depth = _push(todo, todo_t, depth, t, hit.t, bvh.children[node])
         if best_block >= 0:
             hit.triangle = bvh.triangles[best_block][best_lane]
             base = 9 * best_block
@@ -293,18 +305,5 @@ def intersect_instances(
                 origin,
                 inverse,
             )
-            mask = below(t, hit.t)
-            children = tree.children[node]
-            bottom = depth
-            while mask != 0:
-                lane = first_lane(mask)
-                mask = mask & (mask - 1)
-                place = depth
-                while place > bottom and todo_t[place - 1] < t[lane]:
-                    todo_t[place] = todo_t[place - 1]
-                    todo[place] = todo[place - 1]
-                    place -= 1
-                todo_t[place] = t[lane]
-                todo[place] = children[lane]
-                depth += 1
+            depth = _push(todo, todo_t, depth, t, hit.t, tree.children[node])
     return hit
