@@ -1,10 +1,12 @@
 """Rays find the triangles that are there, and none slips between two of them."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import warp as wp
 
-from warp_ir.bvh import Bvh, build_bvh, intersect
+from warp_ir.bvh import Bvh, Trees, intersect
 from warp_ir.procedural import cube, sphere
 
 wp.set_module_options({"enable_backward": False})
@@ -31,7 +33,9 @@ def _shoot(
 
 def shoot(launcher, points, triangles, origins, directions):
     """t, triangle, uv and whether anything was hit, as NumPy arrays."""
-    bvh, _owner = build_bvh(launcher.array(points, wp.vec3), launcher.array(triangles.reshape(-1), wp.int32), launcher)
+    trees = Trees(launcher)
+    trees.build([(launcher.array(points, wp.vec3), launcher.array(triangles.reshape(-1), wp.int32), 0)])
+    (bvh,) = trees.bring_together([[0]])
     n = len(directions)
     out = [launcher.empty(n, d) for d in (wp.float32, wp.int32, wp.vec2, wp.int32)]
     origins = np.broadcast_to(origins, directions.shape)
@@ -123,3 +127,105 @@ def test_many_coincident_triangles(launcher):
         launcher, points, triangles, np.zeros(3), np.array([[0.2, 0.2, 1], [2, 2, 1]], np.float32)
     )
     assert t[0] == 1.0 and triangle[0] >= 0 and triangle[1] == -1
+
+
+# ---- trees that move -------------------------------------------------------------------------------------
+
+
+def rays(count, seed):
+    """Origins around the unit cube, and directions into it."""
+    random = np.random.default_rng(seed)
+    origins = random.uniform(-0.5, 1.5, (count, 3)).astype(np.float32)
+    return origins, (random.random((count, 3)) - origins).astype(np.float32)
+
+
+def hits(launcher, bvh, origins, directions):
+    out = [launcher.empty(len(origins), d) for d in (wp.float32, wp.int32, wp.vec2, wp.int32)]
+    launcher.launch(
+        _shoot, len(origins), [bvh, launcher.array(origins, wp.vec3), launcher.array(directions, wp.vec3), *out]
+    )
+    return [x.numpy() for x in out]
+
+
+def planted(launcher, soups):
+    """Trees over soups that share the tables of a scene, these tables, and the ranges of points."""
+    points = launcher.array(np.concatenate([p for p, _ in soups]), wp.vec3)
+    starts = np.cumsum([0] + [len(p) for p, _ in soups])
+    indices = launcher.array(np.concatenate([t + s for (_, t), s in zip(soups, starts[:-1], strict=True)]), wp.int32)
+    indices = indices.flatten()
+    trees, parts = Trees(launcher), []
+    for k, (_, t) in enumerate(soups):
+        own = launcher.array(t.reshape(-1), wp.int32)
+        parts.append((points[int(starts[k]) : int(starts[k + 1])], own, int(starts[k]) // 3))
+    trees.build(parts)
+    return trees, points, indices, [range(int(a), int(b)) for a, b in pairwise(starts)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 64])
+def test_several_trees_are_one_world(launcher, count):
+    """Soups under a tree each, brought together, are the soup of them all: the same triangles at the same t."""
+    soups = [soup(17 * k + 1, seed=k) for k in range(count)]
+    trees, _, _, _ = planted(launcher, soups)
+    (bvh,) = trees.bring_together([range(count)])
+    starts = np.cumsum([0] + [len(p) for p, _ in soups])
+    points = np.concatenate([p for p, _ in soups])
+    triangles = np.concatenate([t + s for (_, t), s in zip(soups, starts[:-1], strict=True)])
+    origins, directions = rays(2000, 1)
+    t, triangle, uv, any_hit = hits(launcher, bvh, origins, directions)
+    expected = shoot(launcher, points, triangles, origins, directions)
+    for ours, theirs in zip((t, triangle, uv, any_hit >= 0), (*expected[:3], expected[3] >= 0), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 700])
+@pytest.mark.parametrize("way", ["shifted", "bent", "exploded"])
+def test_a_tree_that_moves_finds_what_a_new_one_finds(launcher, count, way):
+    """Hits after a move are those of a tree built there, to the bit; trees beside it are as they were."""
+    still, moving = soup(50, seed=4), soup(count, seed=5)
+    trees, points, indices, ranges = planted(launcher, [still, moving])
+    trees.bring_together([[0, 1]])
+    p = moving[0].astype(np.float64)
+    if way == "shifted":
+        p += (0.3, -0.2, 0.1)
+    elif way == "bent":
+        p[:, 1] += 0.2 * np.sin(9.0 * p[:, 0])
+    else:
+        p = p.reshape(-1, 3, 3)[np.random.default_rng(6).permutation(count)].reshape(-1, 3) * 1.3 - 0.15
+    p = p.astype(np.float32)
+    wp.copy(points, launcher.array(p, wp.vec3), dest_offset=ranges[1].start)
+    good = trees.move(1, points, indices, ranges[1], 50)
+    assert good or way == "exploded"
+    (bvh,) = trees.bring_together([[0, 1]])
+    origins, directions = rays(3000, 7)
+    t, triangle, uv, any_hit = hits(launcher, bvh, origins, directions)
+    everything = np.concatenate([still[0], p]), np.concatenate([still[1], moving[1] + 150])
+    expected = shoot(launcher, *everything, origins, directions)
+    assert (triangle >= 50).any() and (triangle < 50).any()
+    for ours, theirs in zip((t, triangle, uv, any_hit >= 0), (*expected[:3], expected[3] >= 0), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_tree_is_bad_when_its_boxes_have_grown(launcher):
+    """A tree stays good under shifts and scales, for a ray meets as many boxes; not when triangles change places."""
+    moving = soup(5000, seed=8)
+    trees, points, indices, ranges = planted(launcher, [moving])
+    assert trees.move(0, points, indices, ranges[0], 0)
+    places = moving[0].reshape(-1, 3, 3)
+    for moved, good in ((places * 3.0 + 1.0, True), (places[::-1], False), (places, True)):
+        points.assign(np.ascontiguousarray(moved.reshape(-1, 3)))
+        assert trees.move(0, points, indices, ranges[0], 0) is good
+
+
+def test_trees_before_those_that_are_built_anew_stay(launcher):
+    """The last trees are replaced by others, also by fewer, while the first find what they found."""
+    first, second, third = (soup(100, seed=s) for s in (9, 10, 11))
+    trees, points, _, ranges = planted(launcher, [first, second, second])
+    origins, directions = rays(2000, 12)
+    one = hits(launcher, trees.bring_together([[0]])[0], origins, directions)
+    own = launcher.array(third[1].reshape(-1), wp.int32)
+    wp.copy(points, launcher.array(third[0], wp.vec3), dest_offset=ranges[1].start)
+    trees.build([(points[ranges[1].start : ranges[1].stop], own, 100)], keep=1)
+    same, other, both = (hits(launcher, b, origins, directions) for b in trees.bring_together([[0], [1], [0, 1]]))
+    np.testing.assert_array_equal(one[0], same[0])
+    np.testing.assert_array_equal(both[0], np.minimum(same[0], other[0]))
+    np.testing.assert_array_equal(other[0], shoot(launcher, *third, origins, directions)[0])

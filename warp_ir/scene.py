@@ -387,12 +387,13 @@ class Scene:
         albedo = np.array([m.albedo for m in self.materials], dtype=np.float64).reshape(-1, 3).mean(axis=1)
         total, reflected = 0.0, 0.0
         for mesh, group in self._placed():
+            if group is None:
+                areas = _areas_by_material(mesh)
+                total += float(areas.sum())
+                reflected += float(areas @ albedo[: len(areas)]) if mesh.colors is None else _colored_area(mesh)
+                continue
             area = _areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))
-            if group is None:
-                total += float(area.sum())
-                reflected += float((area * rho).sum())
-                continue
             copies = _area_in_world(mesh, group)
             share = area / area.sum() if area.sum() > 0.0 else area
             means: Floats = np.full(len(copies), share @ rho)
@@ -427,8 +428,18 @@ class Scene:
 
 # A mesh that does not move is part of many scenes: what is computed of it is kept as long as it lives.
 _AREAS: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
+_AREAS_BY_MATERIAL: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
+_COLORED_AREAS: WeakKeyDictionary[Mesh, float] = WeakKeyDictionary()
+_MATERIALS: WeakKeyDictionary[Mesh, tuple[int, ...]] = WeakKeyDictionary()
 _AREAS_OF_COPIES: WeakKeyDictionary[Instances, WeakKeyDictionary[Mesh, Floats]] = WeakKeyDictionary()
 _BOXES: WeakKeyDictionary[Mesh | Instances, WeakKeyDictionary[Mesh, tuple[Floats, Floats]]] = WeakKeyDictionary()
+
+
+def materials_of(mesh: Mesh) -> tuple[int, ...]:
+    """Indices of the materials that a mesh's triangles have, ascending."""
+    if mesh not in _MATERIALS:
+        _MATERIALS[mesh] = tuple(np.unique(mesh.material).tolist())
+    return _MATERIALS[mesh]
 
 
 def _areas(mesh: Mesh) -> Floats:
@@ -437,6 +448,21 @@ def _areas(mesh: Mesh) -> Floats:
         a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
         _AREAS[mesh] = np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
     return _AREAS[mesh]
+
+
+def _areas_by_material(mesh: Mesh) -> Floats:
+    """Area of a mesh's triangles of each material, up to the last that it has."""
+    if mesh not in _AREAS_BY_MATERIAL:
+        _AREAS_BY_MATERIAL[mesh] = np.bincount(mesh.material, weights=_areas(mesh)).astype(np.float64)
+    return _AREAS_BY_MATERIAL[mesh]
+
+
+def _colored_area(mesh: Mesh) -> float:
+    """Area times albedo of a mesh with colours."""
+    assert mesh.colors is not None
+    if mesh not in _COLORED_AREAS:
+        _COLORED_AREAS[mesh] = float((_areas(mesh) * mesh.colors.mean(axis=(1, 2))).sum())
+    return _COLORED_AREAS[mesh]
 
 
 def _area_in_world(mesh: Mesh, group: Instances | None) -> Floats:

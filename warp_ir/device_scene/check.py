@@ -7,7 +7,7 @@ import numpy as np
 
 from warp_ir.device_scene.storage import glowing_meshes
 from warp_ir.launch import Launcher
-from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene
+from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000
 """Above this a scene is refused before anything is allocated."""
@@ -16,11 +16,15 @@ _BYTES_PER_INSTANCE = 400
 
 
 def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
-    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here, but meshes `checked` before."""
+    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here.
+
+    `checked` are the ids of meshes and materials that have passed already.
+    """
     for mesh in scene.meshes:
         if id(mesh) not in checked:
             _check_mesh(mesh)
-        if len(mesh.triangles) and not 0 <= mesh.material.min() <= mesh.material.max() < len(scene.materials):
+        used = materials_of(mesh)
+        if used and not 0 <= used[0] <= used[-1] < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     _check_instances(scene)
     glowing = glowing_meshes(scene)
@@ -37,6 +41,8 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
             f" {launcher.device} has {launcher.memory() / 2**30:.1f}"
         )
     for material in scene.materials:
+        if id(material) in checked:
+            continue
         _check_material(material)
         if not all(0.0 <= a <= 1.0 for a in material.albedo):
             raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")

@@ -1,33 +1,33 @@
 """Tables of what the corners of triangles have: normals, colours, texture coordinates."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
-
-from warp_ir.device_scene.records import INSTANCE_COLOR
-from warp_ir.launch import Launcher
+import numpy.typing as npt
 
 
-def upload_corners(
-    corners: list[Any],
-    counts: list[int],
-    launcher: Launcher,
-    dtype: Any = wp.vec3,
-    per_triangle: int = 3,
-    from_instance: Any = None,
-) -> tuple[Any, Any]:
-    """Per-triangle offsets (-1: none) into one table of the corner values of the meshes that have them."""
-    columns = wp.types.type_size(dtype)
-    rows = np.full(max(sum(counts), 1), -1, np.int32)
-    values, triangle, row = [], 0, 0
+def corner_tables(
+    corners: Sequence[Any], counts: Sequence[int], first: int, columns: int = 3, per_triangle: int = 3
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+    """Per-triangle offsets (-1: none) into one table of the corner values of the meshes that have them.
+
+    Args:
+        corners: Of each mesh, values [m, per_triangle, columns], or None.
+        counts: Triangles of each mesh.
+        first: Row at which the table begins.
+        columns: Of a value.
+        per_triangle: Rows of a triangle.
+
+    Returns:
+        Offsets [sum of counts], and the table [r, columns].
+    """
+    rows = np.full(sum(counts), -1, np.int32)
+    values, triangle, row = [np.zeros((0, columns), np.float32)], 0, first
     for corner, count in zip(corners, counts, strict=True):
         if corner is not None:
             rows[triangle : triangle + count] = row + per_triangle * np.arange(count)
-            values.append(corner.reshape(-1, columns))
+            values.append(np.asarray(corner, np.float32).reshape(-1, columns))
             row += per_triangle * count
         triangle += count
-    if from_instance is not None:
-        rows[from_instance] = INSTANCE_COLOR
-    table = np.concatenate(values) if values else np.zeros((1, columns))
-    return launcher.array(rows, wp.int32), launcher.array(table.astype(np.float32), dtype)
+    return rows, np.concatenate(values)

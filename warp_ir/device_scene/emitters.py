@@ -1,6 +1,7 @@
 """One list of everything that emits, lights and surfaces, and how often each is chosen."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,17 @@ from warp_ir.texture import mean_on_triangles
 
 
 def upload_emitters(
-    scene: Scene, gain: npt.NDArray[np.float64], frame: DeviceFrame, data: Any, launcher: Launcher
+    scene: Scene,
+    rows: Sequence[int],
+    gain: npt.NDArray[np.float64],
+    frame: DeviceFrame,
+    data: Any,
+    launcher: Launcher,
 ) -> None:
     """One list of everything that emits, with the probabilities of choosing each: in proportion to its power.
 
-    Any positive probabilities are right; a power is estimated from mean radiance times area, no more. `gain` is what
-    textures and shaping make of each light's.
+    Any positive probabilities are right; a power is estimated from mean radiance times area, no more. `rows` are those
+    of each mesh's first triangle, `gain` is what textures and shaping make of each light's power.
     """
     kinds: list[npt.NDArray[np.int32]] = []
     items: list[npt.NDArray[np.int32]] = []
@@ -39,8 +45,7 @@ def upload_emitters(
         areas.append(np.array([extent / math.pi if light.kind <= LightKind.CYLINDER else np.inf]))
 
     emission = np.array([m.emission for m in scene.materials], np.float64).reshape(-1, 3).mean(axis=1)
-    first = 0
-    for mesh in scene.meshes:
+    for mesh, first in zip(scene.meshes, rows, strict=True):
         glowing = np.nonzero(emission[mesh.material] > 0.0)[0] if emission.any() else np.zeros(0, np.int64)
         if len(glowing):
             a, b, c = (mesh.points[mesh.triangles[glowing, k]] * frame.scale for k in range(3))
@@ -56,7 +61,6 @@ def upload_emitters(
             items.append((first + glowing).astype(np.int32))
             areas.append(sides * area)
             powers.append(power)
-        first += len(mesh.triangles)
 
     tables = (np.concatenate(x) if x else np.zeros(0) for x in (kinds, items, powers, areas))
     kind, item, power, spread = tables

@@ -1,27 +1,32 @@
 """The tables of materials and textures."""
 
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from warp_ir.device_scene.corners import upload_corners
 from warp_ir.device_scene.records import Patterns
 from warp_ir.launch import Launcher
-from warp_ir.scene import Material, Mesh, Texture
-from warp_ir.texture import upload_textures
+from warp_ir.scene import Material, Texture
 
 LARGEST_UV = 1.0e6
 """Texture coordinates beyond are clamped: floats have no digits left for them."""
 
 
 def upload_materials(
-    materials: tuple[Material, ...], meshes: list[Mesh], counts: list[int], data: Any, launcher: Launcher
+    materials: tuple[Material, ...], texture_table: Callable[[list[Texture]], Any], data: Any, launcher: Launcher
 ) -> Any:
-    """Fills the tables of materials and textures, and the uv sets that the textures use; returns their owner."""
+    """Fills the tables of materials; returns the `Patterns`, in which the texture coordinates are still missing.
+
+    Args:
+        materials: Of the scene.
+        texture_table: Puts textures on the device.
+        data: The `SceneData`.
+        launcher: Whose device it is for.
+    """
+    materials = materials or (Material(),)
     textures = list(dict.fromkeys(texture for material in materials for texture in material.textures))
     row: dict[Texture | None, int] = {texture: k for k, texture in enumerate(textures)} | {None: -1}
-    uv_sets = list(dict.fromkeys(texture.uv for texture in textures))
     data.albedo = launcher.array([m.albedo for m in materials], wp.vec3)
     data.emission = launcher.array([m.emission for m in materials], wp.vec3)
     data.opacity = launcher.array([m.opacity for m in materials], wp.float32)
@@ -32,21 +37,9 @@ def upload_materials(
     data.open_count = sum(m.opacity < 1.0 for m in materials)
     data.texture_count = len(textures)
     patterns = Patterns()
-    patterns.textures = upload_textures(textures, uv_sets, launcher)
+    patterns.textures = texture_table(textures)
     unseen = (-1.0, -1.0, -1.0)
     patterns.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
     patterns.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
     data.glow_count = sum(m.glow is not None for m in materials)
-    corners: list[Any] = []
-    for mesh in meshes:
-        sets = [mesh.uvs.get(name) for name in uv_sets]
-        if all(s is None for s in sets):
-            corners.append(None)
-        else:
-            zero = np.zeros((len(mesh.triangles), 3, 2), np.float32)
-            chosen = np.stack([zero if s is None else s for s in sets], axis=1)
-            corners.append(np.asarray(chosen, np.float32).clip(-LARGEST_UV, LARGEST_UV))
-    rows = 3 * max(len(uv_sets), 1)
-    patterns.triangle_uvs, patterns.corner_uvs = upload_corners(corners, counts, launcher, wp.vec2, rows)
-    data.patterns = launcher.array([patterns], Patterns)
     return patterns

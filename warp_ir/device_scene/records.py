@@ -70,7 +70,8 @@ class SceneData:
     glow_count: int  # materials of which the camera sees something else than their emission
     footprint: float  # width of the patch that a reflection of light stands for
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
-    radius: float  # of a sphere around the origin that holds all surfaces
+    centre: wp.vec3  # of a sphere that holds all surfaces, next to the origin
+    radius: float
 
     emitter_count: int
     emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1

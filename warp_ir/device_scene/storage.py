@@ -1,6 +1,12 @@
-"""Where geometry lies in the tables: the world's first, then each prototype's once."""
+"""Where geometry lies in the tables, and which of it shares a tree.
 
-from dataclasses import replace
+First comes what stands still: the world's under one tree, then every prototype under its own. After it comes what
+moves, once for every moment: large meshes under trees of their own, the small ones of the world under one. So what
+moves can be written over, and its trees can change, while nothing else is touched.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,6 +14,11 @@ import numpy.typing as npt
 
 from warp_ir.device_scene.frame import DeviceFrame, frame_of_box
 from warp_ir.scene import Mesh, Scene
+
+_LARGE = 1024
+"""Triangles from which on a mesh that moves has a tree of its own."""
+_MOST = 31
+"""Meshes that have one, at most: those with most triangles."""
 
 
 def glowing_meshes(scene: Scene) -> set[int]:
@@ -32,63 +43,161 @@ def arranged(scene: Scene) -> tuple[Scene, list[int]]:
     return replace(scene, meshes=tuple(scene.meshes[k] for k in numbers), instances=instances), numbers
 
 
-class Storage:
-    """Where points and triangles lie in the tables; prototypes of the same geometry share their points and tree."""
+@dataclass(eq=False)
+class Part:
+    """Meshes in one frame, under one tree."""
 
-    def __init__(self, scene: Scene, frame: DeviceFrame) -> None:
-        """Lays out an arranged scene.
+    meshes: tuple[Mesh, ...]
+    numbers: tuple[int, ...]
+    """Theirs in the scene as the user knows it."""
+    frame: DeviceFrame
+    half: npt.NDArray[np.float64] | None
+    """Of a prototype: half the size of its box, in its frame; None: it is of the world."""
+    colored: bool
+    """Whether its instances have colours."""
+    points: range
+    """Rows."""
+    triangles: range
+    """Rows."""
+    tree: int
+    """Number of the tree."""
+    is_twin: bool = False
+    """Whether it has the points and the tree of a prototype before it, which differs in its looks alone."""
 
-        `points` [n, 3] and `indices` [3 m] are the tables, `parts` the ranges of both that are a hierarchy each, the
-        world's first. For each of the scene's instances, `part` is the number of its prototype, from 0, `first` its
-        first triangle, and `frames` its prototype's frame.
+    def is_in_place_of(self, other: "Part") -> bool:
+        """Whether only points have to move to make this of another: the same rows, tree, and triangles."""
+        rows = (self.points, self.triangles, self.tree, self.is_twin) == (
+            other.points,
+            other.triangles,
+            other.tree,
+            other.is_twin,
+        )
+        return rows and all(
+            len(a.points) == len(b.points) and (a.triangles is b.triangles or np.array_equal(a.triangles, b.triangles))
+            for a, b in zip(self.meshes, other.meshes, strict=True)
+        )
+
+
+@dataclass(eq=False)
+class Moment:
+    """A scene, and where its parts are."""
+
+    scene: Scene
+    """As it is arranged."""
+    numbers: list[int]
+    world: list[Part]
+    prototypes: list[Part]
+    """One for each of the scene's instances."""
+
+    def rows(self) -> list[int]:
+        """The row of the first triangle of each mesh; -1: it has none."""
+        row = dict.fromkeys(range(len(self.numbers)), -1)
+        place = {number: k for k, number in enumerate(self.numbers)}
+        for part in (*self.world, *self.prototypes):
+            first = part.triangles.start
+            for mesh, number in zip(part.meshes, part.numbers, strict=True):
+                row[place[number]] = first
+                first += len(mesh.triangles)
+        return list(row.values())
+
+
+class Layout:
+    """The parts of scenes that differ in what moves, and their rows."""
+
+    def __init__(self, scenes: Sequence[tuple[Scene, list[int]]], frame: DeviceFrame, moving: Collection[str]) -> None:
+        """Lays out arranged scenes.
+
+        Args:
+            scenes: Moments of one scene, and the former numbers of their meshes.
+            frame: Of the world.
+            moving: Names of meshes that are known to move, even if all these moments have the same.
         """
-        instanced = {k for group in scene.instances for k in group.meshes}
-        self._points: list[Any] = []
-        self._indices: list[Any] = []
-        self._point_count = self._index_count = 0
-        for k, mesh in enumerate(scene.meshes):
-            if k not in instanced and len(mesh.triangles):
-                self._add(mesh, frame, self._point_count)
-        self.parts = [(slice(0, self._point_count), slice(0, self._index_count))]
-        self.part: list[int] = []
-        self.first: list[int] = []
-        self.frames: list[DeviceFrame] = []
-        self.halves: list[npt.NDArray[np.float64]] = []
-        known: dict[tuple[int, ...], int] = {}
-        for group in scene.instances:
-            meshes = [scene.meshes[k] for k in group.meshes if len(scene.meshes[k].triangles)]
-            self.first.append(self._index_count // 3)
+        self._frame = frame
+        self.point_count = self.triangle_count = self.tree_count = 0
+        groups = [_groups(scene, numbers) for scene, numbers in scenes]
+        still = [
+            key
+            for key, meshes in groups[0].items()
+            if all(key in others for others in groups[1:]) and not any(mesh.name in moving for mesh in meshes)
+        ]
+        self.head = self._still(groups[0], still)
+        """The parts that stand still."""
+        self.head_end = self.point_count, self.triangle_count, self.tree_count
+        self.tail: list[Part] = []
+        """Those that move."""
+        self.moments: list[Moment] = []
+        for (scene, numbers), own in zip(scenes, groups, strict=True):
+            rest = {key: meshes for key, meshes in own.items() if key not in set(still)}
+            parts = self._moving(rest)
+            self.tail += parts
+            seen = [*self.head, *parts]
+            place = {part.numbers: part for part in seen if part.half is not None}
+            prototypes = [place[key[2]] for key in own if key[0]]
+            self.moments.append(Moment(scene, numbers, [p for p in seen if p.half is None], prototypes))
+
+    def _still(self, groups: "_Groups", keys: Sequence["_Key"]) -> list[Part]:
+        world = [key for key in keys if not key[0]]
+        parts = [self._part([groups[key][0] for key in world], [key[2][0] for key in world])] if world else []
+        return parts + self._prototypes({key: groups[key] for key in keys if key[0]})
+
+    def _moving(self, groups: "_Groups") -> list[Part]:
+        world = [key for key in groups if not key[0]]
+        by_size = sorted(world, key=lambda key: -len(groups[key][0].triangles))
+        large = {key for key in by_size[:_MOST] if len(groups[key][0].triangles) >= _LARGE}
+        parts = [self._part([groups[key][0]], [key[2][0]]) for key in world if key in large]
+        small = [key for key in world if key not in large]
+        if small:
+            parts.append(self._part([groups[key][0] for key in small], [key[2][0] for key in small]))
+        return parts + self._prototypes({key: groups[key] for key in groups if key[0]})
+
+    def _prototypes(self, groups: "_Groups") -> list[Part]:
+        """Prototypes of the same geometry share their points and their tree."""
+        known: dict[tuple[int, ...], Part] = {}
+        parts = []
+        for key, meshes in groups.items():
             geometry = tuple(id(x) for mesh in meshes for x in (mesh.points, mesh.triangles))
             if geometry in known:
                 twin = known[geometry]
-                self.part.append(self.part[twin])
-                self.frames.append(self.frames[twin])
-                self.halves.append(self.halves[twin])
-                begin, count = self.parts[self.part[twin] + 1][1].start, 3 * sum(len(m.triangles) for m in meshes)
-                self._indices.append(np.concatenate(self._indices)[begin : begin + count])
-                self._index_count += count
+                rows = range(self.triangle_count, self.triangle_count + len(twin.triangles))
+                self.triangle_count = rows.stop
+                looks = {"meshes": tuple(meshes), "numbers": key[2], "colored": key[1]}
+                parts.append(replace(twin, **looks, triangles=rows, is_twin=True))
                 continue
-            known[geometry] = len(self.part)
             corners = [mesh.points[np.unique(mesh.triangles)] for mesh in meshes]
             lower = np.min([c.min(axis=0) for c in corners], axis=0)
             upper = np.max([c.max(axis=0) for c in corners], axis=0)
-            own = frame_of_box(lower, upper)
-            point, index = self._point_count, self._index_count
-            for mesh in meshes:
-                self._add(mesh, own, self._point_count)
-            self.part.append(len(self.parts) - 1)
-            self.parts.append((slice(point, self._point_count), slice(index, self._index_count)))
-            self.frames.append(own)
-            self.halves.append(0.5 * (upper - lower) * own.scale)
-        # An empty mesh crashes Warp; three coincident points are never hit.
-        self.points = np.concatenate(self._points or [np.zeros((3, 3), np.float32)])
-        self.indices = np.concatenate(self._indices or [np.arange(3)]).astype(np.int32)
+            frame = frame_of_box(lower, upper)
+            half = 0.5 * (upper - lower) * frame.scale
+            parts.append(replace(self._part(meshes, key[2], frame, half), colored=key[1]))
+            known[geometry] = parts[-1]
+        return parts
 
-    def _add(self, mesh: Mesh, frame: DeviceFrame, first: int) -> None:
-        points = frame.to_device(mesh.points)
-        # A stray point that no triangle uses may be anything: keep it from the bounds and the compiler.
-        points[~np.isfinite(points).all(axis=1)] = 0.0
-        self._points.append(points)
-        self._indices.append((mesh.triangles + first).reshape(-1))
-        self._point_count += len(points)
-        self._index_count += mesh.triangles.size
+    def _part(
+        self, meshes: Sequence[Mesh], numbers: Sequence[int], frame: DeviceFrame | None = None, half: Any = None
+    ) -> Part:
+        points = range(self.point_count, self.point_count + sum(len(m.points) for m in meshes))
+        triangles = range(self.triangle_count, self.triangle_count + sum(len(m.triangles) for m in meshes))
+        self.point_count, self.triangle_count = points.stop, triangles.stop
+        self.tree_count += 1
+        number = self.tree_count - 1
+        return Part(tuple(meshes), tuple(numbers), frame or self._frame, half, False, points, triangles, number)
+
+
+_Key = tuple[bool, bool, tuple[int, ...], tuple[int, ...]]
+"""Whether it is a prototype, and coloured by its instances; the numbers of its meshes, and which objects they are."""
+_Groups = dict[_Key, tuple[Mesh, ...]]
+
+
+def _groups(scene: Scene, numbers: Sequence[int]) -> _Groups:
+    """What may move by itself: each mesh of the world, each prototype; in order, without what has no triangles."""
+    instanced = {k for group in scene.instances for k in group.meshes}
+    members: list[tuple[bool, bool, tuple[int, ...]]] = []
+    members += [(False, False, (k,)) for k in range(len(scene.meshes)) if k not in instanced]
+    members += [(True, group.colors is not None, group.meshes) for group in scene.instances]
+    out: _Groups = {}
+    for is_prototype, colored, every in members:
+        ks = [k for k in every if len(scene.meshes[k].triangles)]
+        if ks:
+            meshes = tuple(scene.meshes[k] for k in ks)
+            out[is_prototype, colored, tuple(numbers[k] for k in ks), tuple(map(id, meshes))] = meshes
+    return out

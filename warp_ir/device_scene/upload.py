@@ -11,13 +11,13 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene.check import check_scene
 from warp_ir.device_scene.emitters import upload_emitters
-from warp_ir.device_scene.frame import DeviceFrame, frame_of_box
+from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
 from warp_ir.device_scene.lights import upload_lights
 from warp_ir.device_scene.records import SceneData
 from warp_ir.device_scene.storage import arranged
-from warp_ir.device_scene.surfaces import upload_surfaces
+from warp_ir.device_scene.surfaces import Surfaces
 from warp_ir.launch import Launcher
-from warp_ir.scene import InputError, Scene
+from warp_ir.scene import InputError, Scene, materials_of
 
 _PATCHES = 2**14
 """Where light is reflected, textures are means over as many patches of the scene's surface: VPLs are no denser."""
@@ -44,6 +44,17 @@ class DeviceScene:
     """The owners of the surfaces and of the lights: a struct holds only their ids, and a freed id crashes."""
     source: Scene
     """What was uploaded."""
+    surfaces: Surfaces
+    """Shared with other moments; and handed on to what is uploaded next."""
+    changes: int
+    """Of the surfaces, when this was uploaded."""
+    bounds: tuple[float, ...]
+    """Lower and upper corner of all moments together, in the world."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether its surfaces are still there."""
+        return self.changes == self.surfaces.changes
 
 
 def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
@@ -60,68 +71,88 @@ def upload_moments(
 ) -> list[DeviceScene]:
     """Checks scenes and copies them to the launcher's device, into one frame.
 
-    What a scene shares with another of them, or with a `previous` one, is uploaded once: surfaces if their meshes
-    are the same objects and their materials are equal, lights if they are the same objects.
+    Meshes, textures and trees that are the same objects in several of them are there once, and lights as well. The
+    surfaces of `previous` ones are taken over and changed where they differ, so those must not be used afterwards.
 
     Raises:
         InputError: As for `upload_scene`.
     """
     with launcher.phase("upload"):
-        checked = {id(mesh) for other in previous for mesh in other.source.meshes}
+        checked = {id(x) for other in previous for x in (*other.source.meshes, *other.source.materials)}
         for scene in scenes:
             check_scene(scene, launcher, checked)
-            checked |= {id(mesh) for mesh in scene.meshes}
+            checked |= {id(x) for x in (*scene.meshes, *scene.materials)}
         bounds = [scene.bounds() for scene in scenes]
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
-        done: list[DeviceScene] = []
-        for scene in scenes:
-            done.append(_upload(scene, lower, upper, launcher, [*done, *previous]))
-        return done
+        extent = float(np.linalg.norm(upper - lower))
+        if not np.isfinite(extent):
+            raise InputError("scene: its extent is too large for a float")
+        frame = steady_frame_of_box(lower, upper)
+        valid = [o for o in previous if o.is_valid and o.frame.equals(frame) and o.bounds == (*lower, *upper)]
+        there = [_find(scene, valid) for scene in scenes]
+        if all(there):
+            return [replace(found, source=scene) for found, scene in zip(there, scenes, strict=True) if found]
+        return _upload(scenes, (lower, upper), frame, launcher, previous[0].surfaces if previous else None)
 
 
-def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: list[DeviceScene]) -> DeviceScene:
-    """One scene into the frame of a bounding box; `others` may have parts of it."""
+def _upload(
+    scenes: Sequence[Scene], bounds: tuple[Any, Any], frame: DeviceFrame, launcher: Launcher, surfaces: Surfaces | None
+) -> list[DeviceScene]:
+    """Scenes that are not all there; `surfaces` may have parts of them."""
+    lower, upper = bounds
     extent = float(np.linalg.norm(upper - lower))
-    if not np.isfinite(extent):
-        raise InputError("scene: its extent is too large for a float")
-    frame = frame_of_box(lower, upper)
-    scale = frame.scale
-    # All of a scene is in its frame: in another one nothing can be used again.
-    others = [o for o in others if o.frame.scale == scale and (o.frame.origin == frame.origin).all()]
-    surfaces = next((o for o in others if _same_surfaces(o.source, scene)), None)
-    lights = next((o for o in others if _same(o.source.lights, scene.lights)), None)
-    if surfaces is not None and surfaces is lights:
-        return replace(surfaces, source=scene)
+    stored = [arranged(scene) for scene in scenes]
+    lit = []
+    for scene in scenes:
+        data = SceneData()
+        data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
+        data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
+        # Links name meshes by their numbers in the scene, not by where they are stored.
+        lit.append((data, *upload_lights(scene, frame, data, launcher)))
+    surfaces = surfaces or Surfaces(launcher)
+    surfaces.take(stored, frame)
+    done: list[DeviceScene] = []
+    for k, (scene, (data, shapes, gain)) in enumerate(zip(scenes, lit, strict=True)):
+        same = _find(scene, done)
+        if same is not None:
+            done.append(replace(same, source=scene))
+            continue
+        area = scene.area() * frame.scale**2
+        data.footprint = math.sqrt(area / _PATCHES)
+        owners = surfaces.fill(k, data)
+        upload_emitters(stored[k][0], surfaces.rows(k), gain, frame, data, launcher)
+        data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+        itself = launcher.array([data], SceneData)
+        data.address = wp.uint64(itself.ptr)
+        done.append(
+            DeviceScene(
+                data=data,
+                frame=frame,
+                extent=extent * frame.scale if extent > 0.0 else 1.0,
+                area=area,
+                mean_albedo=scene.mean_albedo(),
+                max_albedo=_max_albedo(scene),
+                emits=data.emitter_count > 0,
+                keep=(owners, shapes, itself),
+                source=scene,
+                surfaces=surfaces,
+                changes=surfaces.changes,
+                bounds=(*lower, *upper),
+            )
+        )
+    return done
 
-    data = SceneData()
-    if surfaces is not None:
-        for name in SceneData.vars:
-            setattr(data, name, getattr(surfaces.data, name))
-    area = scene.area() * scale**2
-    data.footprint = math.sqrt(area / _PATCHES)
-    data.radius = 0.5 * extent * scale * 1.0001 if extent > 0.0 else 1.0
-    stored, numbers = arranged(scene)
-    owners = surfaces.keep[0] if surfaces is not None else upload_surfaces(stored, numbers, frame, data, launcher)
-    # Links name meshes by their numbers in the scene, not by where they are stored.
-    shapes, gain = upload_lights(scene, frame, data, launcher)
-    upload_emitters(stored, gain, frame, data, launcher)
-    data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
-    itself = launcher.array([data], SceneData)
-    data.address = wp.uint64(itself.ptr)
+
+def _max_albedo(scene: Scene) -> float:
     colors = [x.colors.max() for x in (*scene.meshes, *scene.instances) if x.colors is not None and len(x.colors)]
-    used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
+    used = {k for m in scene.meshes if m.colors is None for k in materials_of(m)}
     colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
-    return DeviceScene(
-        data=data,
-        frame=frame,
-        extent=extent * scale if extent > 0.0 else 1.0,
-        area=area,
-        mean_albedo=scene.mean_albedo(),
-        max_albedo=float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0)),
-        emits=data.emitter_count > 0,
-        keep=(owners, shapes, itself),
-        source=scene,
-    )
+    return float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0))
+
+
+def _find(scene: Scene, others: Sequence[DeviceScene]) -> DeviceScene | None:
+    """One of others that differs from a scene in its camera at most."""
+    return next((o for o in others if _same_surfaces(o.source, scene) and _same(o.source.lights, scene.lights)), None)
 
 
 def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:

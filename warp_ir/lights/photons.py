@@ -30,7 +30,7 @@ def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emissio
     if point.position[3] == 0.0:
         # Parallel light enters through a disk that covers the scene, seen from there.
         d = sampling.to_disk(v)
-        out.origin = scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
+        out.origin = scene.centre + scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
         out.direction = -xyz
         out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
     elif point.normal[3] == 1.0:

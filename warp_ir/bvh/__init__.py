@@ -1,0 +1,28 @@
+"""Rays against triangles.
+
+On CUDA this is Warp's own mesh query. On the CPU, where that query is scalar code on a binary tree, the same tree is
+laid out anew, eight children or eight triangles side by side, and a ray meets eight at a time in vector registers
+(Wald, Benthin and Boulos 2008: "Getting Rid of Packets").
+
+What is seen in many places is stored once: a second tree, over the boxes of its instances, leads rays into the
+hierarchy of the prototype, in whose space they go on.
+"""
+
+from warp_ir.bvh.build import build_instance_tree
+from warp_ir.bvh.lanes import _on_cuda
+from warp_ir.bvh.layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.trees import Trees
+from warp_ir.bvh.walk import intersect, intersect_instances
+
+__all__ = [
+    "Bvh",
+    "Instance",
+    "InstanceTree",
+    "RayHit",
+    "Trees",
+    "TwoLevel",
+    "_on_cuda",
+    "build_instance_tree",
+    "intersect",
+    "intersect_instances",
+]
