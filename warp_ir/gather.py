@@ -20,6 +20,7 @@ from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
 from warp_ir.lights import Bound, arriving, bound_on
+from warp_ir.surface import scene_at
 from warp_ir.vpl import VplBuffer
 
 wp.set_module_options({"enable_backward": False})
@@ -190,6 +191,14 @@ def gather(
     `chosen_set` is taken modulo their number. `u` in [0, 1)² are the offsets of the two systematic choices. VPLs of
     more than `max_bounce` reflections are dark.
     """
+    return _gather(scene.address, lit, chosen_set, x, u, rays, max_bounce)
+
+
+@wp.func(inline=False)
+def _gather(
+    address: wp.uint64, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     chosen = chosen_set & (lit.sets - 1)
     if _on_cuda():
         return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)

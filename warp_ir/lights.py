@@ -21,7 +21,7 @@ from warp_ir.grid import (
 )
 from warp_ir.light_control import linked, shaping_factor
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, closest, emitted, offset, presence, visible
+from warp_ir.surface import Hit, closest, emitted, offset, presence, scene_at, visible
 
 wp.set_module_options({"enable_backward": False})
 
@@ -83,6 +83,12 @@ class Emission:
 @wp.func
 def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
     """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
+    return _sample_light(scene.address, u_pick, u)
+
+
+@wp.func(inline=False)
+def _sample_light(address: wp.uint64, u_pick: float, u: wp.vec2) -> LightPoint:
+    scene = scene_at(address)[0]
     low = int(0)
     high = scene.emitter_count
     while high - low > 1:
@@ -266,7 +272,7 @@ def arriving(scene: SceneData, control: int, position: wp.vec3, mesh: int, seen:
         target: Homogeneous; off its surface.
     """
     if control >= 0:
-        return _arriving_controlled(scene, control, position, mesh, seen, target)
+        return _arriving_controlled(scene.address, control, position, mesh, seen, target)
     if visible(scene, position, target):
         return wp.vec3(1.0)
     return wp.vec3(0.0)
@@ -274,8 +280,9 @@ def arriving(scene: SceneData, control: int, position: wp.vec3, mesh: int, seen:
 
 @wp.func(inline=False)
 def _arriving_controlled(
-    scene: SceneData, row: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4
+    address: wp.uint64, row: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4
 ) -> wp.vec3:
+    scene = scene_at(address)[0]
     control = scene.light_tables[0].controls.rows[row]
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
     factor = shaping_factor(control, scene.light_tables[0].grids, -wp.normalize(to_light))
@@ -325,12 +332,18 @@ class Landing:
     weight: float  # of its flux; 0: it is lost
 
 
-@wp.func(inline=False)
+@wp.func
 def land(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
     """The surface that reflects a photon, whose light may pass through some meshes and not light others.
 
     Meshes it passes through are lit all the same, if they are linked: a coin decides, and doubles the flux.
     """
+    return _land(scene.address, row, first, direction, u)
+
+
+@wp.func(inline=False)
+def _land(address: wp.uint64, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+    scene = scene_at(address)[0]
     out = Landing()
     out.weight = 1.0
     out.hit = first
@@ -416,13 +429,14 @@ def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emissio
         out.direction = sampling.to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
         out.flux = point.intensity * wp.pi
     if point.control >= 0:
-        out = _shaped(scene, point, u, out)
+        out = _shaped(scene.address, point, u, out)
     return out
 
 
 @wp.func(inline=False)
-def _shaped(scene: SceneData, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
+def _shaped(address: wp.uint64, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
     """The photon of a light with a control: in a direction that suits the shaping, or with the factor as a weight."""
+    scene = scene_at(address)[0]
     control = scene.light_tables[0].controls.rows[point.control]
     photon = unshaped
     if control.photons >= 0:
@@ -516,6 +530,16 @@ def lights_found(
     `bsdf_density` is the density per solid angle with which the direction was sampled, for weighting against
     `sample_light`; negative: no weighting.
     """
+    if scene.shape_count > 0 or escapes:
+        return _lights_found(scene.address, origin, direction, t_max, escapes, bsdf_density, mesh)
+    return wp.vec3(0.0)
+
+
+@wp.func(inline=False)
+def _lights_found(
+    address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float, mesh: int
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
@@ -585,6 +609,24 @@ def lights_beyond(
         mesh: The mesh at the origin.
         seen: Whether the camera sees the origin.
     """
+    if scene.shape_count > 0 or scene.only_sampled_count > 0:
+        return _lights_beyond(scene.address, origin, direction, near, cosine, bound, reach, mesh, seen)
+    return wp.vec3(0.0)
+
+
+@wp.func(inline=False)
+def _lights_beyond(
+    address: wp.uint64,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    near: float,
+    cosine: float,
+    bound: Bound,
+    reach: float,
+    mesh: int,
+    seen: bool,
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)

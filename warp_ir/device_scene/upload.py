@@ -106,8 +106,9 @@ def _upload(scene: Scene, lower: Any, upper: Any, launcher: Launcher, others: li
     shapes, gain = upload_lights(scene, frame, data, launcher)
     upload_emitters(stored, gain, frame, data, launcher)
     data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
-    itself = launcher.array([data], SceneData)
-    data.address = wp.uint64(itself.ptr)
+    itself = launcher.empty(1, SceneData)
+    data.address = wp.uint64(itself.ptr)  # in the copy as well: what is called by address hands it on
+    itself.assign(launcher.array([data], SceneData))
     colors = [x.colors.max() for x in (*scene.meshes, *scene.instances) if x.colors is not None and len(x.colors)]
     used = {int(k) for m in scene.meshes if m.colors is None for k in np.unique(m.material)}
     colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
