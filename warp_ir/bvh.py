@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_ir.launch import Launcher
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _LANES = wp.constant(8)
 _LEAF_SIZE = 8

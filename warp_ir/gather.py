@@ -23,7 +23,7 @@ from warp_ir.lights import Bound, arriving, bound_on
 from warp_ir.surface import scene_at
 from warp_ir.vpl import VplBuffer
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 LANES = 16
 _LANES = wp.constant(LANES)

@@ -23,7 +23,7 @@ from warp_ir.launch import Launcher
 from warp_ir.lights import emit, land, sample_light
 from warp_ir.surface import albedo, closest
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MAX_SURVIVAL = 0.999
 """Roulette lets no more than this survive, so that paths end even where nothing absorbs."""
