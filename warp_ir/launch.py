@@ -52,10 +52,19 @@ class Launcher:
         self._cancelled = threading.Event()
 
     def load(self, modules: Sequence[Any]) -> None:
-        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules."""
-        with self.profile.phase("compile"):
-            for module in modules:
-                wp.load_module(module, device=self.device, block_dim=_BLOCK_DIM)
+        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
+
+        Their order is that in which they are begun: those that take longest should come first.
+        """
+        threads = self.threads if self.device.is_cpu else _usable_cores()
+        with self.profile.phase("compile"), ThreadPoolExecutor(min(threads, len(modules))) as pool:
+            work = [pool.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM) for m in modules]
+            try:
+                for done in work:
+                    done.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
         """Runs ``kernel(first, *inputs)`` for indices 0 to `count` - 1.
