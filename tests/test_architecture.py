@@ -76,12 +76,12 @@ def kernels():
 
 @pytest.mark.parametrize("path, kernel", list(kernels()))
 def test_kernels_follow_the_rules(path, kernel):
-    """Private verb, first argument `first`, at most 8 arguments and 75 lines, no adjoint, no atomics, no tiles."""
+    """Private verb, first argument `first`, at most 8 arguments and 75 lines; no adjoint, unrolling, atomics, tiles."""
     arguments = [a.arg for a in kernel.args.args]
     assert kernel.name.startswith("_") and arguments[0] == "first" and len(arguments) <= 8
     assert kernel.end_lineno - kernel.lineno <= 75
     source = path.read_text()
-    assert '"enable_backward": False' in source
+    assert 'wp.set_module_options({"enable_backward": False, "max_unroll": 0})' in source
     assert "atomic_" not in source and "wp.tile" not in source
 
 

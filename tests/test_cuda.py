@@ -1,6 +1,9 @@
 """Every kernel compiles for CUDA, on a machine that has none; and computes the same where there is one."""
 
+import ast
+import ctypes
 import importlib
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,13 @@ import warp as wp
 
 import warp_ir as ir
 from tests.physics.test_invariance import room
+from warp_ir.device_scene import SceneData
 
+wp.set_module_options({"enable_backward": False})
+
+_REGISTERS, _FRAME = 0x2F, 0x11  # EIATTR_REGCOUNT, EIATTR_FRAME_SIZE
+_MOST_REGISTERS = 128
+_MOST_LOCAL = 64
 PACKAGE = Path(ir.__file__).parent
 KERNEL_MODULES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))
@@ -18,12 +27,84 @@ KERNEL_MODULES = [
 ]
 
 
+@wp.kernel
+def _index_locally(first: int, numbers: wp.array[wp.float32], places: wp.array[wp.int32]):
+    i = first + wp.tid()
+    local = wp.zeros(shape=64, dtype=wp.float32)
+    for k in range(64):
+        local[places[i + k]] = numbers[k]
+    numbers[i] = local[places[i]]
+
+
+@wp.kernel
+def _add_one(first: int, numbers: wp.array[wp.float32]):
+    numbers[first + wp.tid()] += 1.0
+
+
 @pytest.mark.parametrize("module", KERNEL_MODULES, ids=lambda m: m.__name__)
 @pytest.mark.parametrize("arch", [pytest.param(75, marks=pytest.mark.slow), 90])
 def test_kernels_compile_for_cuda(module, arch, tmp_path):
-    """Turing and Hopper machine code comes out of every module."""
+    """Turing and Hopper machine code comes out of every module, and no thread asks for more than it should."""
     wp.compile_aot_module(module, arch=arch, module_dir=tmp_path, use_ptx=False)
-    assert [p.stat().st_size > 0 for p in tmp_path.glob("*.cubin")] == [True]
+    (cubin,) = tmp_path.glob("*.cubin")
+    used = resources(cubin)
+    assert len(used) == sum("wp.kernel" in ast.unparse(d) for d in decorators(module))
+    traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
+    for name, (registers, local) in used.items():
+        if traces_rays and local > _MOST_LOCAL:
+            # Calls use the stack, Warp's queries of trees have one of 32 entries each, and 255 registers spill. But
+            # what is as large as the scene's record is a copy of it, or the stack of the CPU's traversal.
+            assert local < ctypes.sizeof(SceneData.ctype), f"{name}: {local} bytes of local memory"
+        else:
+            # 128 registers let a multiprocessor hold 512 threads.
+            assert registers <= _MOST_REGISTERS or traces_rays, f"{name}: {registers} registers"
+            assert local <= _MOST_LOCAL, f"{name}: {local} bytes of local memory"
+
+
+def decorators(module):
+    """Those of the functions of a module."""
+    for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
+        yield from getattr(node, "decorator_list", ())
+
+
+def test_resources_are_read(tmp_path):
+    """A kernel that indexes an array of 64 floats at run time has its 256 bytes in local memory; another has none."""
+    wp.compile_aot_module(wp.get_module(__name__), arch=90, module_dir=tmp_path, use_ptx=False)
+    used = resources(next(tmp_path.glob("*.cubin")))
+    (array,) = (v for k, v in used.items() if k.startswith("_index_locally"))
+    (plain,) = (v for k, v in used.items() if k.startswith("_add_one"))
+    assert array[1] >= 256 and plain[1] == 0
+    assert 4 <= plain[0] <= array[0] <= 64
+
+
+def resources(cubin):
+    """Registers and bytes of local memory (stack and spills) per thread of every kernel of a .cubin file.
+
+    They are attributes in its section .nv.info, of the form (format 4, attribute, 16-bit size, symbol, value).
+    """
+    data = cubin.read_bytes()
+    (table,) = struct.unpack_from("<Q", data, 0x28)
+    size, count, names = struct.unpack_from("<HHH", data, 0x3A)
+    headers = [struct.unpack_from("<IIQQQQIIQQ", data, table + size * k) for k in range(count)]
+
+    def text(offset, strings):
+        begin = strings[4] + offset
+        return data[begin : data.index(b"\0", begin)].decode()
+
+    sections = {text(header[0], headers[names]): header for header in headers}
+    place, end = sections[".nv.info"][4], sum(sections[".nv.info"][4:6])
+    found = {}
+    while place < end:
+        form, attribute, length = struct.unpack_from("<BBH", data, place)
+        place += 4
+        if form != 4:
+            continue  # its value is the length
+        if attribute in (_REGISTERS, _FRAME):
+            symbol, value = struct.unpack_from("<II", data, place)
+            (name,) = struct.unpack_from("<I", data, sections[".symtab"][4] + 24 * symbol)
+            found.setdefault(text(name, sections[".strtab"]), {})[attribute] = value
+        place += length
+    return {k: (v[_REGISTERS], v.get(_FRAME, 0)) for k, v in found.items() if _REGISTERS in v and "$" not in k}
 
 
 @pytest.mark.gpu

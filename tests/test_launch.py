@@ -36,6 +36,14 @@ def test_cancel_abandons():
     assert out.numpy().max() == 0
 
 
+def test_kept_arrays_stay():
+    """A name gives the same array until it needs more rows, and other names give others."""
+    launcher = Launcher("cpu", 1)
+    first = launcher.kept("a", 10, wp.int32)
+    assert launcher.kept("a", 5, wp.int32) is first and launcher.kept("b", 10, wp.int32) is not first
+    assert launcher.kept("a", 100, wp.int32).shape[0] >= 100
+
+
 def test_unknown_device_is_named():
     """A device that is not there is an input error that lists those that are."""
     with pytest.raises(InputError, match=r"cuda:99.*available: cpu"):

@@ -18,7 +18,7 @@ from warp_ir.gbuffer import GBuffer
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 """What `Film.aov` can give beside the radiance."""

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_ir.launch import Launcher
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 LEVELS = 5
 """Passes; their taps lie 1, 2, 4, ... pixels apart."""

@@ -20,9 +20,10 @@ from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
 from warp_ir.lights import Bound, arriving, bound_on
+from warp_ir.surface import scene_at
 from warp_ir.vpl import VplBuffer
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 LANES = 16
 _LANES = wp.constant(LANES)
@@ -190,6 +191,14 @@ def gather(
     `chosen_set` is taken modulo their number. `u` in [0, 1)² are the offsets of the two systematic choices. VPLs of
     more than `max_bounce` reflections are dark.
     """
+    return _gather(scene.address, lit, chosen_set, x, u, rays, max_bounce)
+
+
+@wp.func(inline=False)
+def _gather(
+    address: wp.uint64, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     chosen = chosen_set & (lit.sets - 1)
     if _on_cuda():
         return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
@@ -297,22 +306,31 @@ def _spread_bits(x: int) -> int:
 
 
 @wp.kernel
-def _sort_key(first: int, lit: VplSets, begin: int, extent: float, keys: wp.array[wp.int32]) -> None:
-    """Set, then the place on the Z-order curve, for the VPLs from row `begin` on."""
+def _sort_key(
+    first: int, lights: VplSets, surfaces: VplSets, extent: float, keys: wp.array[wp.int32], order: wp.array[wp.int32]
+) -> None:
+    """Lights before surfaces, then the set, then the place on the Z-order curve."""
     i = first + wp.tid()
-    lit.order[i] = begin + i
-    p = lit.vpls.position[begin + i]
+    order[i] = i
+    p = lights.vpls.position[i]
     code = int(0)
     for k in range(3):
         cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
         code = code | (_spread_bits(cell) << k)
-    keys[i] = code | ((i // (lit.blocks * _LANES)) << 18)
+    if i < lights.count:
+        keys[i] = code | ((i // (lights.blocks * _LANES)) << 18)
+    else:
+        keys[i] = code | (((i - lights.count) // (surfaces.blocks * _LANES)) << 18) | (1 << 24)
 
 
 @wp.kernel
-def _pack(first: int, lit: VplSets) -> None:
-    """Writes block `i`: every lane runs along a part of the set's curve of its own."""
+def _pack(first: int, lights: VplSets, surfaces: VplSets) -> None:
+    """Writes block `i`, those of the lights first: every lane runs along a part of the set's curve of its own."""
     i = first + wp.tid()
+    lit = lights
+    if i >= lights.sets * lights.blocks:
+        i -= lights.sets * lights.blocks
+        lit = surfaces
     begin = (i // lit.blocks) * lit.blocks * _LANES
     for lane in range(_LANES):
         slot = begin + lit.blocks * lane + i % lit.blocks
@@ -373,21 +391,23 @@ def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any
     """
     lights, surfaces = _divide(vpls, vpls.on_lights), _divide(vpls, vpls.count - vpls.on_lights)
     weighed = LANES * max(lights.blocks + surfaces.blocks, 1)
-    for lit, begin in ((lights, 0), (surfaces, vpls.on_lights)):
+    packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
+    # The sort wants room for a second copy.
+    keys = launcher.kept("gather.keys", max(2 * vpls.count, 1), wp.int32)
+    order = launcher.kept("gather.order", max(2 * vpls.count, 1), wp.int32)
+    for lit, name, begin in ((lights, "lights", 0), (surfaces, "surfaces", vpls.on_lights)):
         lit.bound.least = math.pi * weighed / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
         lit.bound.per_density = math.pi * LANES * lights.blocks / _AREAS
-        keys = launcher.empty(max(2 * lit.count, 1), wp.int32)
-        lit.order = launcher.empty(max(2 * lit.count, 1), wp.int32)  # the sort wants room for a second copy
-        launcher.launch(_sort_key, lit.count, [lit, begin, scene.extent, keys])
-        if lit.count:
-            wp.utils.radix_sort_pairs(keys, lit.order, lit.count)
-        rows = 1 if launcher.device.is_cuda else max(_ROWS * lit.sets * lit.blocks, 1)
-        lit.rows = launcher.empty(rows, vec16)
+        lit.order = order[begin:] if lit.count else order
+        blocks = lit.sets * lit.blocks if packed else 0
+        lit.rows = launcher.kept(f"gather.{name}.rows", max(_ROWS * blocks, 1), vec16)
         lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        packed = lit.shaped == 1 and not launcher.device.is_cuda
-        lit.shapes = launcher.empty(max(_SHAPE_ROWS * lit.sets * lit.blocks, 1) if packed else 1, vec16)
-        if not launcher.device.is_cuda:
-            launcher.launch(_pack, lit.sets * lit.blocks, [lit])
-        if packed:
-            launcher.launch(_pack_shaping, lit.sets * lit.blocks, [scene.data, lit])
+        lit.shapes = launcher.kept(f"gather.{name}.shapes", max(_SHAPE_ROWS * blocks * lit.shaped, 1), vec16)
+    if vpls.count:
+        launcher.launch(_sort_key, vpls.count, [lights, surfaces, scene.extent, keys, order])
+        wp.utils.radix_sort_pairs(keys, order, vpls.count)
+    if packed:
+        launcher.launch(_pack, lights.sets * lights.blocks + surfaces.sets * surfaces.blocks, [lights, surfaces])
+        if lights.shaped:
+            launcher.launch(_pack_shaping, lights.sets * lights.blocks, [scene.data, lights])
     return lights, surfaces

@@ -15,7 +15,7 @@ from warp_ir.launch import Launcher
 from warp_ir.lights import lights_found, surface_seen
 from warp_ir.surface import albedo, closest, shading_normal, smooth_rise
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _FARTHEST = wp.constant(1.0e30)  # a plane that a ray meets only there is parallel to it
 _JITTER = wp.constant(wp.uint32(0x6A09E667))

@@ -50,12 +50,22 @@ class Launcher:
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self._cancelled = threading.Event()
+        self._kept: dict[str, Any] = {}
 
     def load(self, modules: Sequence[Any]) -> None:
-        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules."""
-        with self.profile.phase("compile"):
-            for module in modules:
-                wp.load_module(module, device=self.device, block_dim=_BLOCK_DIM)
+        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
+
+        Their order is that in which they are begun: those that take longest should come first.
+        """
+        threads = self.threads if self.device.is_cpu else _usable_cores()
+        with self.profile.phase("compile"), ThreadPoolExecutor(min(threads, len(modules))) as pool:
+            work = [pool.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM) for m in modules]
+            try:
+                for done in work:
+                    done.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
         """Runs ``kernel(first, *inputs)`` for indices 0 to `count` - 1.
@@ -120,6 +130,17 @@ class Launcher:
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""
         return wp.empty(shape, dtype=dtype, device=self.device)
+
+    def kept(self, name: str, rows: int, dtype: Any) -> Any:
+        """An array of at least `rows`, the same whenever `name` asks again: iterations allocate nothing.
+
+        It is uninitialised at first, and later holds what was written to it last.
+        """
+        array = self._kept.get(name)
+        if array is None or array.shape[0] < rows:
+            # Some room, for the number of VPLs differs a little from iteration to iteration.
+            array = self._kept[name] = self.empty(rows + rows // 8, dtype)
+        return array
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An array of zeros on the device."""

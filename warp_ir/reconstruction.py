@@ -23,7 +23,7 @@ from warp_ir.filter import Layer, Surfaces, filter_layer, mean_channel, new_laye
 from warp_ir.gbuffer import GBuffer, Sight, camera_ray, jitter, see, trace_primary
 from warp_ir.launch import Launcher
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _EDGE_RAYS = (16, 256)
 """Camera rays for a pixel on an edge: at least, and at most; in between four for each iteration."""

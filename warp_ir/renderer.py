@@ -23,6 +23,7 @@ from typing import Any
 
 import warp as wp
 
+import warp_ir.bvh
 import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
@@ -86,7 +87,7 @@ class Renderer:
             require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
         self._check_memory()
-        self.launcher.load([warp_ir.gbuffer, warp_ir.film, *_modules(settings.estimator)])
+        self.launcher.load(_modules(settings.estimator, self.launcher))
         self._moments: list[_Moment] = []
         self._gbuffer: Any = None
         self._take(scene)
@@ -262,12 +263,21 @@ def trace_vpls(
     return to_host(vpls, uploaded)
 
 
-def _modules(estimator: str) -> list[Any]:
+def _modules(estimator: str, launcher: Launcher) -> list[Any]:
+    """What has kernels that an estimator needs, those that take longest to compile first."""
+    common = [warp_ir.gbuffer, *([warp_ir.bvh] if launcher.device.is_cpu else []), warp_ir.film]
     if estimator == "vpl":
-        return [warp_ir.vpl, warp_ir.gather, warp_ir.estimators.vpl, warp_ir.filter, warp_ir.reconstruction]
+        return [
+            warp_ir.reconstruction,
+            warp_ir.estimators.vpl,
+            warp_ir.vpl,
+            *common,
+            warp_ir.gather,
+            warp_ir.filter,
+        ]
     if estimator == "keller":
-        return [warp_ir.vpl, warp_ir.estimators.keller]
-    return [warp_ir.estimators.path]
+        return [warp_ir.vpl, warp_ir.estimators.keller, *common]
+    return [warp_ir.estimators.path, *common]
 
 
 def _progress(film: Film, settings: RenderSettings, error: float, reserve: float) -> Progress:

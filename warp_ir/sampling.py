@@ -107,7 +107,7 @@ def _seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
     return hash_combine(hash_combine(scramble, stream), scramble)
 
 
-@wp.func
+@wp.func(inline=False)  # kernels ask for a dozen
 def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> float:
     """Coordinate `dimension` of point `index` of the sequence `scramble`, in [0, 1)."""
     i = wp.uint32(index)

@@ -9,7 +9,7 @@ of a ray into the prototype's space and that of the hit back add to the error.
 
 import warp as wp
 
-from warp_ir.bvh import intersect, intersect_instances
+from warp_ir.bvh import RayHit, intersect, intersect_instances
 from warp_ir.device_scene import INSTANCE_COLOR, Patterns, SceneData
 from warp_ir.sampling import hash_combine
 from warp_ir.texture import coordinates, lookup, mip_level
@@ -132,17 +132,38 @@ def _is_open(scene: SceneData, triangle: int, u: float, v: float) -> bool:
     return (float(bits >> wp.uint32(8)) + 0.5) * (1.0 / 16777216.0) > there
 
 
+@wp.func_native(f"""
+    wp::array_t<{SceneData.native_name}> one;
+    one.data = ({SceneData.native_name}*)address;
+    one.shape[0] = 1;
+    one.strides[0] = sizeof({SceneData.native_name});
+    one.ndim = 1;
+    return one;
+""")
+def scene_at(address: wp.uint64) -> wp.array[SceneData]:
+    """The record at `SceneData.address`, for functions that are called."""
+    ...
+
+
+@wp.func(inline=False)  # the only traversal in a kernel: many copies of it would compile slowly and run no faster
+def _meet(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool) -> RayHit:
+    """The nearest triangle along a ray, open or not; with `any_hit` some, without its coordinates."""
+    scene = scene_at(address)[0]
+    found = intersect(scene.bvh, origin, direction, t_max, any_hit)
+    if scene.instance_count > 0 and not (any_hit and found.triangle >= 0):
+        inside = intersect_instances(scene.two_level, origin, direction, found.t, any_hit)
+        if inside.triangle >= 0:
+            found = inside
+    return found
+
+
 @wp.func
 def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest triangle along a ray, open or not."""
     hit = Hit()
     hit.triangle = -1
     hit.instance = -1
-    found = intersect(scene.bvh, origin, direction, t_max, False)
-    if scene.instance_count > 0:
-        inside = intersect_instances(scene.two_level, origin, direction, found.t, False)
-        if inside.triangle >= 0:
-            found = inside
+    found = _meet(scene.address, origin, direction, t_max, False)
     if found.triangle >= 0:
         hit.triangle = found.triangle
         hit.instance = found.instance
@@ -169,28 +190,15 @@ def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float
     return hit
 
 
-@wp.func_native(f"""
-    wp::array_t<{SceneData.native_name}> one;
-    one.data = ({SceneData.native_name}*)address;
-    one.shape[0] = 1;
-    one.strides[0] = sizeof({SceneData.native_name});
-    one.ndim = 1;
-    return one;
-""")
-def _scene_at(address: wp.uint64) -> wp.array[SceneData]:
-    """The record at `SceneData.address`."""
-    ...
-
-
 @wp.func
 def _way(origin: wp.vec3, target: wp.vec4) -> wp.vec3:
     return wp.vec3(target[0], target[1], target[2]) - origin * target[3]
 
 
-@wp.func(inline=False)  # and by address: handing on the whole record takes it out of the registers of the caller
+@wp.func(inline=False)
 def _nearest_present(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max: float) -> Hit:
     """The nearest triangle on the way to a homogeneous point that is there where the ray meets it."""
-    scene = _scene_at(address)[0]
+    scene = scene_at(address)[0]
     along = _way(origin, target)
     start = origin
     passed = float(0.0)
@@ -228,12 +236,7 @@ def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
     if scene.open_count > 0:
         return _nearest_present(scene.address, origin, target, reach).triangle < 0
-    way = _way(origin, target)
-    if intersect(scene.bvh, origin, way, reach, True).triangle >= 0:
-        return False
-    if scene.instance_count > 0:
-        return intersect_instances(scene.two_level, origin, way, reach, True).triangle < 0
-    return True
+    return _meet(scene.address, origin, _way(origin, target), reach, True).triangle < 0
 
 
 @wp.func
@@ -265,10 +268,16 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
     2021, Hacking the Shadow Terminator). Light that falls on the smooth surface at grazing angles passes behind the
     triangle's plane: from the triangle itself it could not be seen.
     """
-    rise = wp.vec3(0.0)
+    if scene.triangle_normals[hit.triangle] < 0:
+        return wp.vec3(0.0)
+    return _smooth_rise(scene.address, hit)
+
+
+@wp.func(inline=False)
+def _smooth_rise(address: wp.uint64, hit: Hit) -> wp.vec3:
+    scene = scene_at(address)[0]
     row = scene.triangle_normals[hit.triangle]
-    if row < 0:
-        return rise
+    rise = wp.vec3(0.0)
     for k in range(3):
         weight = wp.where(k == 0, hit.u, wp.where(k == 1, hit.v, 1.0 - hit.u - hit.v))
         n = scene.corner_normals[row + k]
@@ -281,11 +290,8 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
         rise += weight * wp.max(below, 0.0) * n
     # What stands on the surface, or close above it, must stay above the point.
     if wp.length_sq(rise) > 0.0:
-        if intersect(scene.bvh, hit.position, rise, 2.0, True).triangle >= 0:
+        if _meet(address, hit.position, rise, 2.0, True).triangle >= 0:
             return wp.vec3(0.0)
-        if scene.instance_count > 0:
-            if intersect_instances(scene.two_level, hit.position, rise, 2.0, True).triangle >= 0:
-                return wp.vec3(0.0)
     return rise
 
 

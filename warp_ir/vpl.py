@@ -21,9 +21,9 @@ from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.lights import emit, land, sample_light
-from warp_ir.surface import albedo, closest
+from warp_ir.surface import albedo, closest, scene_at
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MAX_SURVIVAL = 0.999
 """Roulette lets no more than this survive, so that paths end even where nothing absorbs."""
@@ -34,6 +34,10 @@ _MAX_REFLECTIVITY = 0.98
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
 _UNLIMITED = 2**31 - 1
+_FOLLOWED_AGAIN = 0.02
+"""About the share of the paths that may be longer than what is noted of them."""
+_MOST_NOTED = 2**22
+"""Reflections noted at most, 48 bytes each."""
 
 
 @wp.struct
@@ -63,28 +67,23 @@ class PathSettings:
     fractional: int  # 1: the first survivors[j] paths are reflected j times; 0: roulette by the local albedo
     survivors: wp.array[wp.int32]
     levels: int  # length of survivors
+    noted: int  # reflections of a path that are noted while it is traced
 
 
-@wp.kernel
-def _trace_paths(
-    first: int,
-    scene: SceneData,
-    settings: PathSettings,
-    offsets: wp.array[wp.int32],
-    store: int,
-    vpls: VplBuffer,
-    lengths: wp.array[wp.int32],
-) -> None:
-    """Follows path `i`; counts its reflections, or stores its light in row i and them from paths + offsets[i] on."""
-    i = first + wp.tid()
-    begin = settings.paths + offsets[i]
-    slot = begin
+@wp.func(inline=False)
+def _follow(
+    address: wp.uint64, settings: PathSettings, i: int, vpls: VplBuffer, begin: int, step: int, kept: int, most: int
+) -> int:
+    """Follows path `i` and returns how often it is reflected.
 
+    Its point on the light goes to row i of `vpls`, reflection j to row `begin` + (j - 1) `step`, if kept < j <= most.
+    """
+    scene = scene_at(address)[0]
     u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
     u = sampling.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     share = 1.0 / float(settings.paths)
-    if store == 1:
+    if kept == 0:
         vpls.position[i] = light.position
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity * share
@@ -126,18 +125,55 @@ def _trace_paths(
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
             break
-        if store == 1:
-            vpls.position[slot] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
-            vpls.normal[slot] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-            vpls.intensity[slot] = flux * (share / wp.pi)
-            vpls.bounce[slot] = bounce
-        slot += 1
+        if bounce > kept and bounce <= most:
+            row = begin + (bounce - 1) * step
+            vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
+            vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
+            vpls.intensity[row] = flux * (share / wp.pi)
+            vpls.bounce[row] = bounce
         origin = hit.position
         u = sampling.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = sampling.to_cosine_hemisphere(u, hit.normal)
         dimension += 3
         bounce += 1
-    lengths[i] = slot - begin
+    return bounce - 1
+
+
+@wp.kernel
+def _trace_paths(
+    first: int, scene: SceneData, settings: PathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
+) -> None:
+    """Follows path `i` and notes its light and its first reflections, those of all paths side by side."""
+    i = first + wp.tid()
+    begin = settings.paths + i
+    lengths[i] = _follow(scene.address, settings, i, traced, begin, settings.paths, 0, settings.noted)
+
+
+@wp.kernel
+def _store_paths(
+    first: int,
+    scene: SceneData,
+    settings: PathSettings,
+    traced: VplBuffer,
+    lengths: wp.array[wp.int32],
+    ends: wp.array[wp.int32],
+    vpls: VplBuffer,
+) -> None:
+    """Puts path `i` where it belongs: its light in row i, its reflections behind those of the paths before it."""
+    i = first + wp.tid()
+    begin = settings.paths + ends[i] - lengths[i]
+    for k in range(wp.min(lengths[i], settings.noted) + 1):
+        source = settings.paths * k + i
+        row = wp.where(k == 0, i, begin + k - 1)
+        vpls.position[row] = traced.position[source]
+        vpls.normal[row] = traced.normal[source]
+        vpls.intensity[row] = traced.intensity[source]
+        vpls.bounce[row] = k
+    vpls.density[i] = traced.density[i]
+    if scene.control_count > 0:
+        vpls.control[i] = traced.control[i]
+    if lengths[i] > settings.noted:
+        _follow(scene.address, settings, i, vpls, begin, 1, settings.noted, lengths[i])
 
 
 def survivors(paths: int, mean_albedo: float) -> npt.NDArray[np.int32]:
@@ -162,6 +198,8 @@ def emit_vpls(
 ) -> Any:
     """Traces light paths and returns the `VplBuffer` of all their vertices; none if nothing emits.
 
+    Its arrays are the launcher's, have room to spare, and are overwritten by the next call.
+
     Args:
         scene: The uploaded scene.
         launcher: Where to run.
@@ -171,38 +209,47 @@ def emit_vpls(
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
     if not scene.emits:
-        return _buffer(scene, launcher, 0, 0)
-    alive = survivors(paths, scene.mean_albedo)
+        return _buffer(scene, launcher, "vpls", 0, 0)
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
     settings.paths = paths
     settings.max_bounces = _UNLIMITED if max_bounces is None else max_bounces
-    settings.fractional = int(absorption == "fractional")
-    settings.survivors = launcher.array(alive, wp.int32)
-    settings.levels = len(alive)
+    settings.survivors = launcher.kept("survivors", 1, wp.int32)
+    if absorption == "fractional":
+        alive = survivors(paths, scene.mean_albedo)
+        settings.fractional, settings.levels = 1, len(alive)
+        settings.survivors = launcher.array(alive, wp.int32)
+    settings.noted = min(_noted(paths, scene.mean_albedo), settings.max_bounces)
 
-    # Two passes, count and store, give every path its rows without an atomic or a limit on its length.
-    lengths = launcher.empty(paths, wp.int32)
-    offsets = launcher.zeros(paths + 1, wp.int32)
-    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 0, _buffer(scene, launcher, 0, 0), lengths])
-    wp.utils.array_scan(lengths, offsets[1:], inclusive=True)
-    vpls = _buffer(scene, launcher, paths, int(offsets[paths:].numpy()[0]))
-    launcher.launch(_trace_paths, paths, [scene.data, settings, offsets, 1, vpls, lengths])
+    # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
+    lengths, ends = launcher.kept("lengths", paths, wp.int32), launcher.kept("ends", paths, wp.int32)
+    traced = _buffer(scene, launcher, "traced", paths, paths * settings.noted)
+    launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
+    wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
+    vpls = _buffer(scene, launcher, "vpls", paths, int(ends[paths - 1 : paths].numpy()[0]))
+    launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls])
     launcher.profile.counts["light_paths"] += paths
     launcher.profile.counts["vpls"] += vpls.count
     return vpls
 
 
-def _buffer(scene: DeviceScene, launcher: Launcher, on_lights: int, on_surfaces: int) -> Any:
+def _noted(paths: int, mean_albedo: float) -> int:
+    """Reflections to note of every path: few paths go on after them, which then have to be followed again."""
+    rho = min(max(mean_albedo, 0.05), 0.95)
+    return max(min(math.ceil(math.log(_FOLLOWED_AGAIN) / math.log(rho)), _MOST_NOTED // paths), 1)
+
+
+def _buffer(scene: DeviceScene, launcher: Launcher, name: str, on_lights: int, on_surfaces: int) -> Any:
     vpls = VplBuffer()
     vpls.on_lights, vpls.count = on_lights, on_lights + on_surfaces
     rows = max(vpls.count, 1)
-    vpls.position = launcher.empty(rows, wp.vec4)
-    vpls.normal = launcher.empty(rows, wp.vec4)
-    vpls.intensity = launcher.empty(rows, wp.vec3)
-    vpls.bounce = launcher.empty(rows, wp.int32)
-    vpls.density = launcher.empty(max(on_lights, 1), wp.float32)
-    vpls.control = launcher.empty(max(on_lights, 1) if scene.data.control_count > 0 else 1, wp.int32)
+    vpls.position = launcher.kept(name + ".position", rows, wp.vec4)
+    vpls.normal = launcher.kept(name + ".normal", rows, wp.vec4)
+    vpls.intensity = launcher.kept(name + ".intensity", rows, wp.vec3)
+    vpls.bounce = launcher.kept(name + ".bounce", rows, wp.int32)
+    vpls.density = launcher.kept(name + ".density", max(on_lights, 1), wp.float32)
+    controls = max(on_lights, 1) if scene.data.control_count > 0 else 1
+    vpls.control = launcher.kept(name + ".control", controls, wp.int32)
     return vpls
 
 

@@ -9,7 +9,7 @@ from warp_ir.bvh.layout import INFINITY, LANES, Bvh, Instance, InstanceTree, vec
 from warp_ir.bvh.warp_tree import box_corner, is_leaf, link, node_count, primitive, tree_of, tree_root
 from warp_ir.launch import Launcher
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _LEAF_SIZE = 8
 

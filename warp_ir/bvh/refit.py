@@ -13,7 +13,7 @@ from warp_ir.bvh.layout import INFINITY, Bvh
 from warp_ir.bvh.warp_tree import box_corner
 from warp_ir.launch import Launcher
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 @wp.kernel

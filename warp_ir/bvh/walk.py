@@ -48,39 +48,15 @@ def _push(
 def _hierarchy(name: str, loose: bool) -> Any:
     """The function that follows a ray through a hierarchy, whose boxes and triangles are larger if it is loose."""
 
-    @wp.func(name=name, inline=True)
-    def hierarchy(
-        bvh: Bvh,
-        mesh: wp.uint64,
-        root: int,
-        origin: wp.vec3,
-        direction: wp.vec3,
-        t_max: float,
-        any_hit: bool,
-        error: wp.vec3,
+    @wp.func(name=name + "_walk")
+    def walk(
+        bvh: Bvh, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool, error: wp.vec3
     ) -> RayHit:
-        """The nearest triangle of one hierarchy, which is `mesh` on CUDA and begins at `root` on the CPU.
-
-        `error` is how far the ray may be off in each axis, if the hierarchy is loose.
-        """
+        """The CPU's part, apart from CUDA's: where it is not called, its stack takes no memory either."""
         hit = RayHit()
         hit.triangle = -1
         hit.instance = -1
         hit.t = t_max
-        if _on_cuda():
-            if any_hit:
-                if wp.mesh_query_ray_anyhit(mesh, origin, direction, t_max):
-                    hit.triangle = 0
-            else:
-                query = wp.mesh_query_ray(mesh, origin, direction, t_max)
-                if query.result:
-                    hit.triangle = query.face
-                    hit.t = query.t
-                    hit.u = query.u
-                    hit.v = query.v
-                    hit.front = wp.where(wp.dot(query.normal, direction) < 0.0, 1, 0)
-            return hit
-
         inverse = reciprocal(direction)
         near_x = wp.where(inverse[0] < 0.0, 3, 0)
         near_y = wp.where(inverse[1] < 0.0, 4, 1)
@@ -180,6 +156,40 @@ def _hierarchy(name: str, loose: bool) -> Any:
             hit.front = wp.where(determinant > 0.0, 1, 0)
         return hit
 
+    @wp.func(name=name)
+    def hierarchy(
+        bvh: Bvh,
+        mesh: wp.uint64,
+        root: int,
+        origin: wp.vec3,
+        direction: wp.vec3,
+        t_max: float,
+        any_hit: bool,
+        error: wp.vec3,
+    ) -> RayHit:
+        """The nearest triangle of one hierarchy, which is `mesh` on CUDA and begins at `root` on the CPU.
+
+        `error` is how far the ray may be off in each axis, if the hierarchy is loose.
+        """
+        hit = RayHit()
+        hit.triangle = -1
+        hit.instance = -1
+        hit.t = t_max
+        if _on_cuda():
+            if any_hit:
+                if wp.mesh_query_ray_anyhit(mesh, origin, direction, t_max):
+                    hit.triangle = 0
+            else:
+                query = wp.mesh_query_ray(mesh, origin, direction, t_max)
+                if query.result:
+                    hit.triangle = query.face
+                    hit.t = query.t
+                    hit.u = query.u
+                    hit.v = query.v
+                    hit.front = wp.where(wp.dot(query.normal, direction) < 0.0, 1, 0)
+            return hit
+        return walk(bvh, root, origin, direction, t_max, any_hit, error)
+
     return hierarchy
 
 
@@ -243,32 +253,15 @@ def _enter_instance(
     return hit
 
 
-@wp.func(inline=False)
-def intersect_instances(
-    scene: wp.array[TwoLevel], origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool
+@wp.func
+def _walk_instances(
+    bvh: Bvh, tree: InstanceTree, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool
 ) -> RayHit:
-    """The nearest triangle of any instance before t_max; with `any_hit` some, without its coordinates.
-
-    `scene` has one row, and is no struct, for a struct that a call needs would be copied by every ray, even by those of
-    scenes without instances.
-    """
-    bvh = scene[0].bvh
-    tree = scene[0].tree
+    """The CPU's part, as above."""
     hit = RayHit()
     hit.triangle = -1
     hit.instance = -1
     hit.t = t_max
-    number = int(0)
-    if _on_cuda():
-        query = wp.bvh_query_ray(tree.bvh, origin, direction)
-        while wp.bvh_query_next(query, number, hit.t):
-            found = _enter_instance(bvh, tree, number, origin, direction, hit.t, any_hit)
-            if found.triangle >= 0:
-                hit = found
-                if any_hit:
-                    return hit
-        return hit
-
     inverse = reciprocal(direction)
     near_x = wp.where(inverse[0] < 0.0, 3, 0)
     near_y = wp.where(inverse[1] < 0.0, 4, 1)
@@ -307,3 +300,31 @@ def intersect_instances(
             )
             depth = _push(todo, todo_t, depth, t, hit.t, tree.children[node])
     return hit
+
+
+@wp.func(inline=False)
+def intersect_instances(
+    scene: wp.array[TwoLevel], origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool
+) -> RayHit:
+    """The nearest triangle of any instance before t_max; with `any_hit` some, without its coordinates.
+
+    `scene` has one row, and is no struct, for a struct that a call needs would be copied by every ray, even by those of
+    scenes without instances.
+    """
+    bvh = scene[0].bvh
+    tree = scene[0].tree
+    hit = RayHit()
+    hit.triangle = -1
+    hit.instance = -1
+    hit.t = t_max
+    number = int(0)
+    if _on_cuda():
+        query = wp.bvh_query_ray(tree.bvh, origin, direction)
+        while wp.bvh_query_next(query, number, hit.t):
+            found = _enter_instance(bvh, tree, number, origin, direction, hit.t, any_hit)
+            if found.triangle >= 0:
+                hit = found
+                if any_hit:
+                    return hit
+        return hit
+    return _walk_instances(bvh, tree, origin, direction, t_max, any_hit)

@@ -100,4 +100,6 @@ class SceneData:
     shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
 
     sobol: wp.array[wp.uint32]
-    address: wp.uint64  # of a copy of this record on the device: what is called seldom takes no more than this
+    # Of a copy of this record on the device. Functions that are called, and not copied into their callers, take this: a
+    # record of this size passed by value would be written out at every call, and kept from the registers of the caller.
+    address: wp.uint64

@@ -122,8 +122,9 @@ def _upload(
         owners = surfaces.fill(k, data)
         upload_emitters(stored[k][0], surfaces.rows(k), gain, frame, data, launcher)
         data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
-        itself = launcher.array([data], SceneData)
-        data.address = wp.uint64(itself.ptr)
+        itself = launcher.empty(1, SceneData)
+        data.address = wp.uint64(itself.ptr)  # in the copy as well: what is called by address hands it on
+        itself.assign(launcher.array([data], SceneData))
         done.append(
             DeviceScene(
                 data=data,

@@ -28,7 +28,7 @@ from warp_ir.sampling import iteration_scramble
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl import VplBuffer, emit_vpls
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 @wp.func

@@ -20,7 +20,7 @@ from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sam
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _MAX_SURVIVAL = wp.constant(0.999)
 _UNLIMITED = 2**31 - 1

@@ -26,7 +26,7 @@ from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.vpl import emit_vpls
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _UNLIMITED = 2**31 - 1
 _SHADOW_RAYS = (2, 3)

@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_ir.device_scene import SceneData
 from warp_ir.light_control import linked, shaping_factor
-from warp_ir.surface import Hit, closest, leave, visible
+from warp_ir.surface import Hit, closest, leave, scene_at, visible
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,7 +57,7 @@ def arriving(scene: SceneData, control: int, position: wp.vec3, mesh: int, seen:
         target: Homogeneous; off its surface.
     """
     if control >= 0:
-        return _arriving_controlled(scene, control, position, mesh, seen, target)
+        return _arriving_controlled(scene.address, control, position, mesh, seen, target)
     if visible(scene, position, target):
         return wp.vec3(1.0)
     return wp.vec3(0.0)
@@ -65,8 +65,9 @@ def arriving(scene: SceneData, control: int, position: wp.vec3, mesh: int, seen:
 
 @wp.func(inline=False)
 def _arriving_controlled(
-    scene: SceneData, row: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4
+    address: wp.uint64, row: int, position: wp.vec3, mesh: int, seen: bool, target: wp.vec4
 ) -> wp.vec3:
+    scene = scene_at(address)[0]
     control = scene.light_tables[0].controls.rows[row]
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
     factor = shaping_factor(control, scene.light_tables[0].grids, -wp.normalize(to_light))

@@ -6,7 +6,7 @@ from warp_ir.device_scene import SceneData
 from warp_ir.lights.arriving import CROSSINGS, arriving, behind, may_find, only_sampled, shaping_along
 from warp_ir.lights.found import emission_towards
 from warp_ir.lights.shape import control_of, control_of_surface, face_radiance, hit_shape
-from warp_ir.surface import Hit, closest, emission
+from warp_ir.surface import Hit, closest, emission, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,6 +58,24 @@ def lights_beyond(
         mesh: The mesh at the origin.
         seen: Whether the camera sees the origin.
     """
+    if scene.shape_count > 0 or scene.control_count > 0:
+        return _lights_beyond(scene.address, origin, direction, near, cosine, bound, reach, mesh, seen)
+    return wp.vec3(0.0)
+
+
+@wp.func(inline=False)
+def _lights_beyond(
+    address: wp.uint64,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    near: float,
+    cosine: float,
+    bound: Bound,
+    reach: float,
+    mesh: int,
+    seen: bool,
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
@@ -82,13 +100,13 @@ def lights_beyond(
                 total += wp.cw_mul(face_radiance(scene, light, origin, direction, hit[3]), arrives) * share
     if scene.control_count > 0:
         if scene.light_tables[0].controls.sampled_surfaces > 0:
-            total += _sampled_surfaces_beyond(scene, origin, direction, cosine, bound, reach, mesh, seen)
+            total += _sampled_surfaces_beyond(scene.address, origin, direction, cosine, bound, reach, mesh, seen)
     return total
 
 
 @wp.func(inline=False)
 def _sampled_surfaces_beyond(
-    scene: SceneData,
+    address: wp.uint64,
     origin: wp.vec3,
     direction: wp.vec3,
     cosine: float,
@@ -98,6 +116,7 @@ def _sampled_surfaces_beyond(
     seen: bool,
 ) -> wp.vec3:
     """The same of emissive surfaces that see other surfaces than rays do: all along the ray, whatever hides them."""
+    scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     start = origin
     passed = float(0.0)

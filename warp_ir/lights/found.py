@@ -16,7 +16,7 @@ from warp_ir.lights.shape import (
     texture_of,
 )
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, emission, glow, has_glow
+from warp_ir.surface import Hit, emission, glow, has_glow, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,6 +34,16 @@ def lights_found(
     `bsdf_density` is the density per solid angle with which the direction was sampled, for weighting against
     `sample_light`; negative: no weighting.
     """
+    if scene.shape_count > 0 or escapes:
+        return _lights_found(scene.address, origin, direction, t_max, escapes, bsdf_density, mesh)
+    return wp.vec3(0.0)
+
+
+@wp.func(inline=False)
+def _lights_found(
+    address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_density: float, mesh: int
+) -> wp.vec3:
+    scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)

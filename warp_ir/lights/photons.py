@@ -8,7 +8,7 @@ from warp_ir.grid import cell_direction, sample_cell
 from warp_ir.light_control import linked, shaping_factor
 from warp_ir.lights.arriving import CROSSINGS, behind
 from warp_ir.lights.points import LightPoint
-from warp_ir.surface import Hit, closest
+from warp_ir.surface import Hit, closest, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,13 +42,14 @@ def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emissio
         out.direction = sampling.to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
         out.flux = point.intensity * wp.pi
     if point.control >= 0:
-        out = _shaped(scene, point, u, out)
+        out = _shaped(scene.address, point, u, out)
     return out
 
 
 @wp.func(inline=False)
-def _shaped(scene: SceneData, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
+def _shaped(address: wp.uint64, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
     """The photon of a light with a control: in a direction that suits the shaping, or with the factor as a weight."""
+    scene = scene_at(address)[0]
     control = scene.light_tables[0].controls.rows[point.control]
     photon = unshaped
     if control.photons >= 0:
@@ -71,12 +72,18 @@ class Landing:
     weight: float  # of its flux; 0: it is lost
 
 
-@wp.func(inline=False)
+@wp.func
 def land(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
     """The surface that reflects a photon, whose light may pass through some meshes and not light others.
 
     Meshes it passes through are lit all the same, if they are linked: a coin decides, and doubles the flux.
     """
+    return _land(scene.address, row, first, direction, u)
+
+
+@wp.func(inline=False)
+def _land(address: wp.uint64, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+    scene = scene_at(address)[0]
     out = Landing()
     out.weight = 1.0
     out.hit = first

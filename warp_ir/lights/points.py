@@ -22,7 +22,7 @@ from warp_ir.lights.shape import (
     world_from_dome,
 )
 from warp_ir.scene import LightKind
-from warp_ir.surface import emitted, offset, presence
+from warp_ir.surface import emitted, offset, presence, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,6 +92,12 @@ def sample_emitter(scene: SceneData, choice: Choice, u: wp.vec2) -> LightPoint:
 @wp.func
 def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
     """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
+    return _sample_light(scene.address, u_pick, u)
+
+
+@wp.func(inline=False)
+def _sample_light(address: wp.uint64, u_pick: float, u: wp.vec2) -> LightPoint:
+    scene = scene_at(address)[0]
     choice = choose_emitter(scene, u_pick)
     return sample_emitter(scene, choice, u)
 
