@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdUtils
 
 import warp_ir as ir
 from tests.test_usd_material import QUADS, load, material_text, only_material, warned
@@ -118,6 +118,24 @@ def test_a_linear_wide_gamut_is_converted(tmp_path):
     text = textured(file="a.exr").replace("@a.exr@", '@a.exr@ (colorSpace = "lin_ap1_scene")')
     pixels = only_material(load(tmp_path, text + mesh())).albedo_texture.pixels
     np.testing.assert_allclose(pixels[0, 0], (1.0, 0.0, 0.0), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["lin_ap1_scene", "g22_rec709_scene", "srgb_p3d65_scene", "lin_rec2020", "acescg"])
+def test_colour_spaces_by_name(tmp_path, image, name):
+    """The node may name any of USD's spaces: the picture is what USD converts its colours to, cut at 0."""
+    texture = only_material(
+        load(tmp_path, textured(f'token inputs:sourceColorSpace = "{name}"') + mesh())
+    ).albedo_texture
+    known = {"lin_rec2020": "lin_rec2020_scene", "acescg": "lin_ap1_scene"}
+    source, target = Gf.ColorSpace(known.get(name, name)), Gf.ColorSpace("lin_rec709_scene")
+    expected = [target.Convert(source, Gf.Vec3f(*rgb)).GetRGB() for rgb in image[..., :3].reshape(-1, 3).tolist()]
+    expected = np.clip(np.reshape(expected, (2, 3, 3)), 0.0, 1.0)
+    np.testing.assert_allclose(texture.pixels, expected, atol=2.0**-10)
+
+
+def test_an_unknown_colour_space_is_named(tmp_path, image):
+    scene = load(tmp_path, textured('token inputs:sourceColorSpace = "crayon"') + mesh())
+    assert warned(scene, "/A: inputs:file", "unknown colour space 'crayon'")
 
 
 def test_transforms(tmp_path, image):

@@ -15,6 +15,7 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd import value
+from warp_ir.usd.color import between, color_space
 from warp_ir.usd.inputs import Inputs
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shaping import read_shaping
@@ -185,13 +186,16 @@ def _texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     if layout not in ("automatic", "latlong"):
         inputs.warn(f"dome textures of the format '{layout}' are not read: it emits its constant colour")
         return None
-    space = inputs.attribute("texture:file").GetColorSpace()
+    space = str(inputs.attribute("texture:file").GetColorSpace() or "auto")
     try:
-        image = read_texture(asset, space if space in ("raw", "sRGB") else "auto", _TEXELS[kind])
+        primaries = color_space(space)
+        rgb = read_texture(asset, space, _TEXELS[kind]).rgb
     except Unreadable as trouble:
         inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
         return None
-    return np.clip(image.rgb, 0.0, _BRIGHTEST_TEXEL)
+    if primaries is not None:
+        rgb = rgb @ between(primaries, None).T.astype(np.float32)
+    return np.clip(rgb, 0.0, _BRIGHTEST_TEXEL)
 
 
 def _dome_from_pole(inputs: Inputs) -> Floats:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
 from warp_ir.mipmap import resized
 from warp_ir.scene import Floats, Texture, Wrap
 from warp_ir.usd import value
+from warp_ir.usd.color import between, color_space
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.texture import MAX_PIXELS, Image, read_texture
 
@@ -27,9 +28,6 @@ _NODE_BUDGET = 256
 """Most nodes that one input may need: shared nodes count every time they are used."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
-_SRGB_NAMES = ("srgb_texture", "srgb", "srgb_rec709_scene", "sRGB")
-_LINEAR_NAMES = {"acescg": Gf.ColorSpaceNames.LinearAP1, "lin_srgb": Gf.ColorSpaceNames.LinearRec709}
-_UNSAID = ("", "auto", "raw", "data", "identity", "unknown", Gf.ColorSpaceNames.LinearRec709, "lin_rec709", "none")
 
 
 @dataclass(frozen=True)
@@ -371,16 +369,22 @@ class Network:
             asset = Sdf.AssetPath(asset)
         if attribute is None or not isinstance(asset, Sdf.AssetPath) or not asset.path:
             raise Unreadable("no image file is named")
-        authored = str(attribute.GetColorSpace() or "")
-        if space == "auto" and authored in _SRGB_NAMES:
-            space = "sRGB"
-        elif space == "auto" and authored and authored != "auto":
-            space = "raw"
+        space = self._space(attribute, space)
         if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
             return self._udim(attribute, asset, space, fallback, channels)
         image = self._images.read(asset, space)
-        pixels = _converted(_channels(image, channels), authored)
-        return image, pixels, (asset.resolvedPath or asset.path, space, authored), (1, 1)
+        pixels = _converted(_channels(image, channels), space)
+        return image, pixels, (asset.resolvedPath or asset.path, space), (1, 1)
+
+    def _space(self, attribute: Usd.Attribute, said: str) -> str:
+        """An image's colour space: what the node says of it, else what stands on the attribute, else "auto"."""
+        found = said if said not in ("", "auto") else str(attribute.GetColorSpace() or "auto")
+        try:
+            color_space(found)
+        except Unreadable as trouble:
+            self.warn(f"{attribute.GetName()} has the {trouble}; it is guessed")
+            return "auto"
+        return found
 
     def _udim(
         self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats, channels: list[int]
@@ -408,7 +412,7 @@ class Network:
         atlas = np.empty((rows * height, columns * width, len(channels)), np.float16)
         atlas[:] = fallback[channels]
         for at, image in images.items():
-            tile = _channels(image, channels)
+            tile = _converted(_channels(image, channels), space)
             if tile.shape[:2] != (height, width):
                 tile = resized(tile, height, width)
             top, left = (rows - 1 - at // 10) * height, at % 10 * width
@@ -478,14 +482,10 @@ def _converted(pixels: Floats, space: str) -> Floats:
     """Linear pixels [h, w, 3 or 4] of a colour space as Rec.709; fewer channels are no colour."""
     if pixels.shape[2] < 3:
         return pixels
-    name = _LINEAR_NAMES.get(space.lower(), space)
-    if name.lower() in _UNSAID or space in _SRGB_NAMES or not Gf.ColorSpace.IsValid(name):
+    primaries = color_space(space)
+    if primaries is None or space == "sRGB":
         return pixels
-    target, source = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709), Gf.ColorSpace(name)
-    if source.GetGamma() != 1.0:
-        return pixels
-    matrix = np.array([target.Convert(source, Gf.Vec3f(*axis)).GetRGB() for axis in np.eye(3).tolist()])
-    rgb = np.maximum(np.asarray(pixels[..., :3], np.float32) @ matrix.astype(np.float32), 0.0)
+    rgb = np.maximum(np.asarray(pixels[..., :3], np.float32) @ between(primaries, None).T.astype(np.float32), 0.0)
     return np.concatenate([rgb, pixels[..., 3:]], axis=-1)
 
 
