@@ -9,6 +9,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from warp_ir.scene import InputError
 from warp_ir.usd.crate import check_sizes
+from warp_ir.usd.redirect import with_documents
 from warp_ir.usd.report import Report
 
 _SHOWN = 5
@@ -57,26 +58,33 @@ def open_stage(
     if session_layer is not None:
         stronger = _layer(session_layer)
         session.subLayerPaths.append(stronger.identifier)
+    paths = [*mask, *(text for text in needed if Sdf.Path.IsValidPathString(text))] if mask else []
     try:
-        if mask:
-            paths = [text for text in needed if Sdf.Path.IsValidPathString(text)]
-            stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask([*mask, *paths]))
-            stage.ExpandPopulationMask()
-        else:
-            stage = Usd.Stage.Open(root, session)
+        stage = _composed(root, session, paths)
+        for text in mask:
+            if not stage.GetPrimAtPath(text):
+                raise InputError(f"mask: there is no prim {text}")
+        for text in variants:
+            _select_variant(stage, text)
+        instead = with_documents(stage, report)
+        if instead:
+            stage = _composed(instead[0], session, paths)
     except (Tf.ErrorException, RuntimeError) as error:
         raise _unopened(path, error) from None
-    for text in mask:
-        if not stage.GetPrimAtPath(text):
-            raise InputError(f"mask: there is no prim {text}")
-    for text in variants:
-        _select_variant(stage, text)
     errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
     for text in list(errors)[:_SHOWN]:
         report.warn("/", f"composition: {text}")
     if len(errors) > _SHOWN:
         report.warn("/", f"composition: {len(errors) - _SHOWN} more errors")
     report.stats["composition_errors"] = len(errors)
+    return stage
+
+
+def _composed(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.Stage:
+    if not mask:
+        return Usd.Stage.Open(root, session)
+    stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask(list(mask)))
+    stage.ExpandPopulationMask()
     return stage
 
 
