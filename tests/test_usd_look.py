@@ -138,6 +138,63 @@ def test_an_unknown_colour_space_is_named(tmp_path, image):
     assert warned(scene, "/A: inputs:file", "unknown colour space 'crayon'")
 
 
+UNPACK = "float4 inputs:scale = (2, 2, 2, 1)\n float4 inputs:bias = (-1, -1, -1, 0)"
+RAW = 'token inputs:sourceColorSpace = "raw"'
+
+
+def test_a_normal_map(tmp_path):
+    """The pixels of a normal map are vectors: 128/127.5 - 1 of a byte; beyond the image the surface is smooth."""
+    pixels = np.uint8([[[0, 128, 255], [255, 128, 128]]])
+    write(tmp_path / "a.png", pixels)
+    scene = load(tmp_path, textured(f"{UNPACK}\n {RAW}", target="normal3f inputs:normal") + mesh())
+    texture = only_material(scene).normal_texture
+    np.testing.assert_allclose(texture.pixels, pixels / 127.5 - 1.0, atol=2.0**-11)
+    assert texture.outside == (0.0, 0.0, 1.0) and not warned(scene, "normal")
+    packed = load(tmp_path, textured(RAW, target="normal3f inputs:normal") + mesh())
+    assert warned(packed, "/A: normal: the map leans to one side")
+
+
+@pytest.mark.parametrize("value, expected", [((0, 0, 1), None), ((0.6, 0, 0.8), (0.6, 0, 0.8)), ((0, 9, 1), (0, 1, 1))])
+def test_constant_normals(tmp_path, value, expected):
+    """One normal everywhere is an image of one texel; straight up is none."""
+    texture = only_material(load(tmp_path, material_text(f"normal3f inputs:normal = {value}") + mesh())).normal_texture
+    assert (texture is None) == (expected is None)
+    if texture is not None:
+        assert texture.pixels == pytest.approx(np.reshape(expected, (1, 1, 3)), abs=1e-3) and texture.uv == "st"
+
+
+NORMALMAP = """
+    def Shader "N" {
+        uniform token info:id = "ND_normalmap_float"
+        float3 inputs:in.connect = </A/I.outputs:out>
+        float inputs:scale = 0.5
+        SPACE
+        float3 outputs:out
+    }
+    def Shader "I" {
+        uniform token info:id = "ND_image_vector3"
+        asset inputs:file = @a.png@
+        float3 outputs:out
+    }
+"""
+
+
+@pytest.mark.parametrize("surface", ["standard_surface", "open_pbr_surface"])
+def test_normal_maps_of_materialx(tmp_path, surface):
+    """The node normalmap unpacks and scales; other vectors are in world space, which images are not."""
+    pixels = np.uint8([[[128, 128, 255], [255, 0, 128]]])
+    write(tmp_path / "a.png", pixels)
+    name = "normal" if surface == "standard_surface" else "geometry_normal"
+    inputs = f"float3 inputs:{name}.connect = </A/N.outputs:out>"
+    text = material_text(inputs, shader=f"ND_{surface}_surfaceshader", output="mtlx:surface").rstrip()[:-1]
+    texture = only_material(load(tmp_path, text + NORMALMAP.replace("SPACE", "") + "}\n" + mesh())).normal_texture
+    np.testing.assert_allclose(texture.pixels, (pixels / 127.5 - 1.0) * (0.5, 0.5, 1.0), atol=2.0**-11)
+    world = text + NORMALMAP.replace("SPACE", 'string inputs:space = "object"') + "}\n" + mesh()
+    assert warned(load(tmp_path, world), "/A", name, "tangent space")
+    image = text.replace("A/N.", "A/I.") + NORMALMAP.replace("SPACE", "") + "}\n" + mesh()
+    assert warned(load(tmp_path, image), "/A", name, "only a normalmap is read")
+
+
 def test_transforms(tmp_path, image):
     """UsdTransform2d scales, then rotates counter-clockwise, then moves: (1, 0) goes to (0, 2) + (0.25, 0.5)."""
     nodes = (
@@ -376,16 +433,17 @@ def test_real_files(file, images):
 
 def test_what_is_read_in_vain_is_named(tmp_path, image):
     """Normal maps, and primvars where only constants and images count, are said once; unset interfaces are not."""
-    assert warned(load(tmp_path, textured(target="normal3f inputs:normal") + mesh()), "/A", "normal", "not rendered")
+    target = "float inputs:displacement"
+    assert warned(load(tmp_path, textured(output="r", target=target) + mesh()), "/A", "displacement", "not rendered")
     opacity = textured(target="float inputs:opacity", output="result").replace("UsdUVTexture", "UsdPrimvarReader_float")
     opacity = opacity.replace(
         "asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1'
     )
     assert warned(load(tmp_path, opacity + mesh()), "/A", "opacity", "'veil'")
-    plain = material_text("normal3f inputs:normal.connect = </A.inputs:unset>").replace(
-        "token outputs:surface.connect", "normal3f inputs:unset\n token outputs:surface.connect"
+    plain = material_text("float inputs:displacement.connect = </A.inputs:unset>").replace(
+        "token outputs:surface.connect", "float inputs:unset\n token outputs:surface.connect"
     )
-    assert not warned(load(tmp_path, plain + mesh("")), "normal")
+    assert not warned(load(tmp_path, plain + mesh("")), "displacement")
 
 
 @pytest.mark.parametrize(

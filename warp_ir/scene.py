@@ -104,6 +104,9 @@ class Material:
     albedo_texture: Texture | None = None
     emission_texture: Texture | None = None
     opacity_texture: Texture | None = None
+    normal_texture: Texture | None = None
+    """Normals [x, y, z], of any length, by which the camera sees the surface lit: x where the first of the mesh's
+    texture coordinates grows, y where the second does, z out of the front. Without such coordinates it does nothing."""
 
     def __post_init__(self) -> None:
         if self.albedo_texture is not None:
@@ -116,7 +119,7 @@ class Material:
     @property
     def textures(self) -> tuple[Texture, ...]:
         """Those it has."""
-        found = (self.albedo_texture, self.emission_texture, self.opacity_texture)
+        found = (self.albedo_texture, self.emission_texture, self.opacity_texture, self.normal_texture)
         return tuple(texture for texture in found if texture is not None)
 
 

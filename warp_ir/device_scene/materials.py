@@ -31,7 +31,9 @@ def upload_materials(
     data.opacity_texture = launcher.array([row[m.opacity_texture] for m in materials], wp.int32)
     data.open_count = sum(m.opacity < 1.0 for m in materials)
     data.texture_count = len(textures)
+    data.normal_map_count = sum(m.normal_texture is not None for m in materials)
     patterns = Patterns()
+    patterns.normal_texture = launcher.array([row[m.normal_texture] for m in materials], wp.int32)
     patterns.textures = upload_textures(textures, uv_sets, launcher)
     corners: list[Any] = []
     for mesh in meshes:

@@ -23,6 +23,7 @@ class Patterns:
     textures: TextureTable
     triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
     corner_uvs: wp.array[wp.vec2]
+    normal_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
 
 
 @wp.struct
@@ -63,6 +64,7 @@ class SceneData:
     emission_texture: wp.array[wp.int32]
     opacity_texture: wp.array[wp.int32]
     texture_count: int
+    normal_map_count: int  # materials with one
     patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
     open_count: int  # materials whose opacity is below 1 anywhere
     footprint: float  # width of the patch that a reflection of light stands for

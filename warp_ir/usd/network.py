@@ -294,6 +294,11 @@ class Network:
             return combine(kind, np.subtract, get("amount", 1.0), get("in", 0.0))
         if kind == "clamp":
             return combine(kind, np.clip, get("in", 0.0), get("low", 0.0), get("high", 1.0))
+        if kind == "normalmap":
+            if self._text(node.GetInput("space"), "tangent") != "tangent":
+                raise Unreadable("only normal maps in tangent space are read")
+            weight = get("scale", 1.0)
+            return combine(kind, _unpacked_normal, as_color(get("in", 0.5, 0.5, 1.0)), weight)
         if kind == "luminance":
             weights = np.array([0.2126729, 0.7151522, 0.0721750])
             return combine(
@@ -465,6 +470,12 @@ class Network:
     def _text(self, shader_input: UsdShade.Input, default: str = "") -> str:
         attribute = value.producer(shader_input)
         return value.text(attribute, self._time, default) or default if attribute is not None else default
+
+
+def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
+    """Normals from numbers between 0 and 1, by MaterialX's node normalmap, whose scale is for x and y."""
+    across = np.broadcast_to(scale, (*scale.shape[:-1], 2))
+    return np.asarray((2.0 * packed - 1.0) * np.concatenate([across, np.ones_like(scale[..., :1])], axis=-1))
 
 
 def _channels(image: Image, channels: list[int]) -> Floats:

@@ -6,7 +6,7 @@ that share of the rays through, straight on; emission is lost with it.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd, UsdShade
@@ -14,7 +14,7 @@ from pxr import Usd, UsdShade
 from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
 from warp_ir.usd.light import BRIGHTEST
-from warp_ir.usd.network import Images, Network, Signal, as_color, combine, constant
+from warp_ir.usd.network import Images, Network, Place, Signal, as_color, combine, constant
 from warp_ir.usd.report import Unreadable
 
 _GREY: Color = (0.18, 0.18, 0.18)
@@ -87,6 +87,36 @@ class _Inputs:
             self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
 
+    def normal(self, name: str, *, tangent: bool) -> Signal | None:
+        """A normal map, in tangent space; None where there is none, or a flat one.
+
+        Args:
+            name: Of the input.
+            tangent: Whether the input itself is in tangent space; otherwise a node `normalmap` has to feed it.
+        """
+        given = value.producer(self._shader.GetInput(name))
+        if given is None:
+            return None
+        if not tangent:
+            if not UsdShade.Output.IsOutput(given):
+                return None
+            node = str(UsdShade.Shader(given.GetPrim()).GetShaderId() or "an unnamed node")
+            if not node.startswith("ND_normalmap"):
+                self.warn(f"{name}: only a normalmap is read, not {node}; the surface's own normals are used")
+                return None
+        found = as_color(self.network.evaluate(self._shader.GetInput(name), constant(0.0, 0.0, 1.0)))
+        if found.primvar:
+            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
+        if np.abs(found.pixels).max() > 1.0:
+            found = combine("normal", lambda n: np.clip(n, -1.0, 1.0), found)
+        x, y, z = found.mean.tolist()
+        if found.place is None:
+            return None if x == y == 0.0 else replace(found, place=Place())  # one texel
+        if math.hypot(x, y) > 0.5 * abs(z):
+            self.warn(f"{name}: the map leans to one side; is it raw, with scale 2 and bias -1 ({{n}} materials)?")
+        # Beyond an image that ends, the surface is smooth.
+        return replace(found, outside=np.array([0.0, 0.0, 1.0]), key=("normal", found.key))
+
     def unread(self, *names: str) -> None:
         """Name the inputs that are authored in vain."""
         for name in names:
@@ -115,7 +145,8 @@ def _preview_surface(inputs: _Inputs) -> Surface | None:
     else:
         albedo = _metal(inputs, "metallic", albedo)
     emission = inputs.color("emissiveColor", _BLACK)
-    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0))
+    opacity, threshold = inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
+    return _surface(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
 
 
 def _standard_surface(inputs: _Inputs) -> Surface | None:
@@ -125,7 +156,7 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
     albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
-    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0)
+    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False))
 
 
 def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
@@ -135,7 +166,8 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
     albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
-    return _surface(inputs, albedo, emission, inputs.grey("geometry_opacity", 1.0), 0.0)
+    opacity, normal = inputs.grey("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
+    return _surface(inputs, albedo, emission, opacity, 0.0, normal)
 
 
 _READERS = {
@@ -182,7 +214,9 @@ def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
     return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _unit(t))), albedo, coat, tint)
 
 
-def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float) -> Surface | None:
+def _surface(
+    inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float, normal: Signal | None
+) -> Surface | None:
     """A record with an albedo that conserves energy and an emission that exists; None if nothing is there."""
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
@@ -204,7 +238,7 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
         inputs.warn("partial opacity lets a share of the light through, straight on ({n} materials)")
-    inputs.unread("normal", "displacement", "geometry_normal")
+    inputs.unread("displacement")
     network = inputs.network
     textured = opacity.place is not None and not opaque
     material = Material(
@@ -216,6 +250,7 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
         None if albedo.place is None else network.texture(_bounded(albedo)),
         None if emission.place is None or emission.pixels.max() == 0.0 else network.texture(_bounded(emission)),
         network.texture(_bounded(opacity)) if textured else None,
+        None if normal is None else network.texture(normal),
     )
     return Surface(material, albedo.primvar)
 
