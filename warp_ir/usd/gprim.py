@@ -8,6 +8,7 @@ from pxr import Sdf, Usd, UsdLux
 
 from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
 from warp_ir.usd import value
+from warp_ir.usd.binding import PURPOSES
 from warp_ir.usd.glow import glow
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.instancing import combined, combined_colors
@@ -61,6 +62,7 @@ def build_meshes(
     shapes: _Shapes | None = None,
     images: Images | None = None,
     metals: str = "diffuse",
+    purposes: Sequence[str] = PURPOSES[:2],
 ) -> Geometry:
     """All meshes, one per gprim with all its copies, those that are instanced, and the materials they use.
 
@@ -72,11 +74,12 @@ def build_meshes(
         shapes: Those that are known already; new ones are added.
         images: Those that are known already, likewise.
         metals: "diffuse" or "black".
+        purposes: Of the bindings of materials, in the order in which they are wanted.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    table = MaterialTable(time, report, images, metals)
+    table = MaterialTable(time, report, images, metals, purposes)
     return _Builder(time, report, levels, table, {} if shapes is None else shapes).run(sites)
 
 

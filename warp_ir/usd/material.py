@@ -8,6 +8,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from warp_ir.scene import Floats, Ints, Material
 from warp_ir.usd import primvar, value
+from warp_ir.usd.binding import PURPOSES, bound_materials, order_of
 from warp_ir.usd.network import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape
@@ -47,12 +48,19 @@ class MaterialTable:
         report: Where troubles go.
         images: Those that are known already; None: none are.
         metals: "diffuse" or "black".
+        purposes: Of bindings, in the order in which they are wanted.
     """
 
     def __init__(
-        self, time: Usd.TimeCode, report: Report, images: Images | None = None, metals: str = "diffuse"
+        self,
+        time: Usd.TimeCode,
+        report: Report,
+        images: Images | None = None,
+        metals: str = "diffuse",
+        purposes: Sequence[str] = PURPOSES[:2],
     ) -> None:
         self.materials: list[Material] = []
+        self._purposes = purposes
         self._time, self._report = time, report
         self._images, self._black_metals = images or Images(report), metals == "black"
         self._images.report = report
@@ -71,15 +79,13 @@ class MaterialTable:
     def resolve(self, prims: Sequence[Usd.Prim]) -> None:
         """Find the materials bound to prims and to their subsets; at once, for USD shares the work."""
         prims = [p for prim in prims for p in (prim, *material_subsets(prim))]
-        found, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(prims, UsdShade.Tokens.full)
-        unbound = [prim for prim, material in zip(prims, found, strict=True) if not material]
-        second, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(unbound, UsdShade.Tokens.preview)
-        for prim, material in zip(prims, found, strict=True):
-            if material:
-                self._bound[prim.GetPath()] = self._index_of(material)
-        for prim, material in zip(unbound, second, strict=True):
-            if material:
-                self._report.warn(prim.GetPath(), "only a material for the purpose 'preview' is bound; it is used")
+        for prim, found in zip(prims, bound_materials(prims, order_of(self._purposes)), strict=True):
+            if found is not None:
+                material, purpose = found
+                if purpose and purpose not in self._purposes:
+                    self._report.warn(
+                        prim.GetPath(), f"only a material for the purpose '{purpose}' is bound; it is used"
+                    )
                 self._bound[prim.GetPath()] = self._index_of(material)
             elif (target := _dangling_target(prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the material it is bound to, {target}, does not exist")
