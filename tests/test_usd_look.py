@@ -310,7 +310,7 @@ def test_images_are_read_once_and_only_where_used(tmp_path, image):
 
 def test_more_pixels_than_the_budget(tmp_path, image, monkeypatch):
     """Images are averaged down, said once, and keep their mean."""
-    monkeypatch.setattr("warp_ir.usd.network.MAX_TEXTURE_PIXELS", 8)
+    monkeypatch.setattr("warp_ir.usd.images.MAX_TEXTURE_PIXELS", 8)
     scene = load(tmp_path, textured('token inputs:sourceColorSpace = "raw"') + mesh())
     assert scene.stats["texels"] <= 4 and warned(scene, "a.png", "averaged down")
 

@@ -10,11 +10,11 @@ from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
 from warp_ir.usd import value
 from warp_ir.usd.binding import PURPOSES
 from warp_ir.usd.glow import glow
+from warp_ir.usd.images import Images
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.instancing import combined, combined_colors
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
-from warp_ir.usd.network import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
 from warp_ir.usd.sharing import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share

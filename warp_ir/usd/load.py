@@ -13,10 +13,10 @@ from pxr import Tf, Usd
 from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import Geometry, build_meshes
+from warp_ir.usd.images import Images
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.linking import link
 from warp_ir.usd.motion import Motion
-from warp_ir.usd.network import Images
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis

@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 from warp_ir.scene import Floats, Ints, Material
 from warp_ir.usd import primvar, value
 from warp_ir.usd.binding import PURPOSES, bound_materials, order_of
-from warp_ir.usd.network import Images
+from warp_ir.usd.images import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape
 from warp_ir.usd.surface import read_material

@@ -1,183 +1,25 @@
-"""Networks of shading nodes as values: constants, images in place on a surface, or primvars.
-
-An image that is scaled, tinted or mixed with constants is again an image, so all of that is done once, here, and
-renders for nothing. Two images that lie in the same place are combined pixel by pixel; if they do not, the second
-counts as its mean.
-"""
+"""Networks of shading nodes, evaluated: what an input of a surface shader gets."""
 
 import math
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.mipmap import resized
 from warp_ir.scene import Floats, Texture, Wrap
 from warp_ir.usd import value
-from warp_ir.usd.color import between, color_space
-from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.texture import MAX_PIXELS, Image, read_texture
+from warp_ir.usd.images import Images
+from warp_ir.usd.report import Unreadable
+from warp_ir.usd.signal import Place, Signal, as_color, combine, constant, select
 
-MAX_TEXTURE_PIXELS = 2**27
-"""Of all images of a scene: each takes at most half of what is left."""
 _DEPTH = 32
 """Longest chain of nodes that is followed."""
 _NODE_BUDGET = 256
 """Most nodes that one input may need: shared nodes count every time they are used."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
-
-
-@dataclass(frozen=True)
-class Place:
-    """How an image lies on a surface."""
-
-    uv: str = "st"
-    transform: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """What comes out of a network."""
-
-    pixels: Floats
-    """float [h, w, c], [1, 1, c] for a constant; row 0 at the top."""
-    outside: Floats
-    """float [c], the value beyond the image's edges."""
-    place: Place | None
-    """None: it is a constant."""
-    key: Hashable
-    """Equal where the content is."""
-    name: str = ""
-    """Of the image."""
-    primvar: str = ""
-    """Read from the surface's primvar of this name; `pixels` is the value where it has none."""
-
-    @property
-    def mean(self) -> Floats:
-        """Over the pixels, float64 [c]."""
-        return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
-
-
-def constant(*channels: float) -> Signal:
-    """The same everywhere."""
-    at = np.array(channels, np.float64)
-    return Signal(at.reshape(1, 1, -1), at, None, tuple(channels))
-
-
-def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> Signal:
-    """A function of signals, pixel by pixel; it takes and gives arrays [..., c].
-
-    Args:
-        label: Tells functions apart.
-        function: Of as many arrays.
-        signals: Their arguments.
-    """
-    images = [s for s in signals if s.place is not None]
-    key = (label, *(s.key for s in signals))
-    if not images:
-        made = _finite(function(*(s.pixels for s in signals)))
-        return Signal(made, made[0, 0], None, key)
-    first = images[0]
-    together = [s for s in images if s.place == first.place]
-    height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
-    pixels, outside = [], []
-    for s in signals:
-        if s.place is not None and s.place != first.place:
-            pixels.append(s.mean.reshape(1, 1, -1))
-            outside.append(s.mean)
-        else:
-            fits = s.place is None or s.pixels.shape[:2] == (height, width)
-            pixels.append(s.pixels if fits else resized(s.pixels, height, width))
-            outside.append(s.outside)
-    made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
-    made = np.broadcast_to(made, (height, width, made.shape[-1]))
-    return Signal(_compact(made), _finite(function(*outside)), first.place, key, first.name)
-
-
-def _finite(values: Floats) -> Floats:
-    """Arithmetic in a file may overflow."""
-    return np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
-
-
-def select(signal: Signal, channels: list[int]) -> Signal:
-    """Some channels, in any order."""
-    pixels, outside = signal.pixels[..., channels], np.asarray(signal.outside)[channels]
-    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key))
-
-
-def as_color(signal: Signal) -> Signal:
-    """Three channels: the first three, or one thrice."""
-    count = signal.pixels.shape[2]
-    if count == 3:
-        return signal
-    return select(signal, [0, 1, 2] if count > 3 else [0, 0, 0])
-
-
-class Images:
-    """The images of a scene and the textures made of them, each once.
-
-    Args:
-        report: Where troubles and counts go.
-        default_wrap: The wrap mode where neither the network nor the file gives one.
-    """
-
-    def __init__(self, report: Report, default_wrap: str = "black") -> None:
-        self.report = report
-        self.default_wrap = default_wrap
-        self._images: dict[tuple[str, str], Image | str] = {}
-        self._textures: dict[Hashable, Texture] = {}
-        self._left = MAX_TEXTURE_PIXELS
-
-    def read(self, asset: Sdf.AssetPath, space: str, resolved: str = "") -> Image:
-        """An image, from the file the first time.
-
-        Raises:
-            Unreadable: There is none.
-        """
-        key = (resolved or asset.resolvedPath or asset.path, space)
-        if key not in self._images:
-            limit = max(min(MAX_PIXELS, self._left // 2), 1)
-            try:
-                image = read_texture(resolved or asset, space, limit)
-            except Unreadable as trouble:
-                self._images[key] = str(trouble)
-            else:
-                self._left -= image.pixels.shape[0] * image.pixels.shape[1]
-                self._images[key] = replace(image, pixels=_compact(image.pixels))
-                self.report.stats["images"] += 1
-                if image.pixels.shape[:2] != (image.height, image.width):
-                    self.report.warn(asset.path, "image averaged down to fit the memory for textures ({n} in all)")
-        found = self._images[key]
-        if isinstance(found, str):
-            raise Unreadable(found)
-        return found
-
-    def texture(self, signal: Signal) -> Texture:
-        """A signal as a texture; equal ones are the same."""
-        assert signal.place is not None
-        key = (signal.key, signal.place)
-        if key not in self._textures:
-            red, green, blue = np.broadcast_to(signal.outside, 3).tolist()
-            self._textures[key] = Texture(
-                signal.name,
-                signal.pixels,
-                signal.place.wrap,
-                (red, green, blue),
-                signal.place.uv,
-                np.array(signal.place.transform, np.float64),
-            )
-        return self._textures[key]
-
-
-def _compact(pixels: Floats) -> Floats:
-    """In halves where they are enough: 11 bits from 6e-5 to 65504."""
-    if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
-        return pixels
-    return pixels.astype(np.float16)
 
 
 class Network:
@@ -314,7 +156,9 @@ class Network:
         attribute = value.producer(node.GetInput("file"))
         space = self._text(node.GetInput("sourceColorSpace"), "auto")
         try:
-            image, pixels, key, atlas = self._pixels(attribute, space, fallback, channels)
+            image, pixels, key, atlas = self._images.look_up(
+                attribute, self._time, space, fallback, channels, self.warn
+            )
         except Unreadable as trouble:
             self.warn(f"{trouble}; the texture's fallback is used")
             return constant(*fallback[channels].tolist())
@@ -343,7 +187,9 @@ class Network:
         try:
             space = "auto" if wanted.startswith("color") else "raw"
             channels = list(range(count))
-            _, pixels, key, atlas = self._pixels(attribute, space, np.resize(default, 4), channels)
+            _, pixels, key, atlas = self._images.look_up(
+                attribute, self._time, space, np.resize(default, 4), channels, self.warn
+            )
         except Unreadable as trouble:
             self.warn(f"{trouble}; the image's default is used")
             return constant(*default.tolist())
@@ -364,66 +210,6 @@ class Network:
         """The path that an asset attribute holds."""
         asset = value.raw(attribute, self._time) if attribute is not None else None
         return asset.path if isinstance(asset, Sdf.AssetPath) else str(asset or "")
-
-    def _pixels(
-        self, attribute: Usd.Attribute | None, space: str, fallback: Floats, channels: list[int]
-    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
-        """The image that an attribute names: itself, some of its channels rgba [h, w, c], a key, its UDIM tiles."""
-        asset = value.raw(attribute, self._time) if attribute is not None else None
-        if isinstance(asset, str):
-            asset = Sdf.AssetPath(asset)
-        if attribute is None or not isinstance(asset, Sdf.AssetPath) or not asset.path:
-            raise Unreadable("no image file is named")
-        space = self._space(attribute, space)
-        if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
-            return self._udim(attribute, asset, space, fallback, channels)
-        image = self._images.read(asset, space)
-        pixels = _converted(_channels(image, channels), space)
-        return image, pixels, (asset.resolvedPath or asset.path, space), (1, 1)
-
-    def _space(self, attribute: Usd.Attribute, said: str) -> str:
-        """An image's colour space: what the node says of it, else what stands on the attribute, else "auto"."""
-        found = said if said not in ("", "auto") else str(attribute.GetColorSpace() or "auto")
-        try:
-            color_space(found)
-        except Unreadable as trouble:
-            self.warn(f"{attribute.GetName()} has the {trouble}; it is guessed")
-            return "auto"
-        return found
-
-    def _udim(
-        self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats, channels: list[int]
-    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
-        """The tiles of a UDIM set side by side in one image; those that are missing show the fallback."""
-        stack = attribute.GetPropertyStack(self._time)
-        tiles = UsdShade.UdimUtils.ResolveUdimTilePaths(asset.path, stack[0].layer if stack else None)
-        places = {int(number) - 1001: str(path) for path, number in tiles if str(number).isdigit()}
-        places = {at: path for at, path in places.items() if 0 <= at < 100}
-        if not places:
-            raise Unreadable(f"image '{asset.path}': no tile of it exists")
-        images: dict[int, Image] = {}
-        for at, path in sorted(places.items()):
-            try:
-                images[at] = self._images.read(asset, space, path)
-            except Unreadable as trouble:
-                self.warn(f"{trouble}; the texture's fallback is used")
-        if not images:
-            raise Unreadable(f"image '{asset.path}': no tile of it can be read")
-        columns, rows = max(at % 10 for at in images) + 1, max(at // 10 for at in images) + 1
-        height = max(image.pixels.shape[0] for image in images.values())
-        width = max(image.pixels.shape[1] for image in images.values())
-        shrink = math.sqrt(min(MAX_PIXELS / (height * width * columns * rows), 1.0))
-        height, width = max(int(height * shrink), 1), max(int(width * shrink), 1)
-        atlas = np.empty((rows * height, columns * width, len(channels)), np.float16)
-        atlas[:] = fallback[channels]
-        for at, image in images.items():
-            tile = _converted(_channels(image, channels), space)
-            if tile.shape[:2] != (height, width):
-                tile = resized(tile, height, width)
-            top, left = (rows - 1 - at // 10) * height, at % 10 * width
-            atlas[top : top + height, left : left + width] = tile
-        first = next(iter(images.values()))
-        return first, atlas, (asset.path, tuple(sorted(places.items())), space), (columns, rows)
 
     def _coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
         """The uv set that an input reads, and what is done to it, [3, 3]."""
@@ -476,28 +262,6 @@ def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
     """Normals from numbers between 0 and 1, by MaterialX's node normalmap, whose scale is for x and y."""
     across = np.broadcast_to(scale, (*scale.shape[:-1], 2))
     return np.asarray((2.0 * packed - 1.0) * np.concatenate([across, np.ones_like(scale[..., :1])], axis=-1))
-
-
-def _channels(image: Image, channels: list[int]) -> Floats:
-    """Channels of an image as if it had r, g, b and a, [h, w, c]; without a copy where possible."""
-    pixels, count = image.pixels, image.pixels.shape[2]
-    if channels == [0, 1, 2] and count >= 3:
-        return pixels[..., :3]
-    if channels == [3]:
-        return image.alpha[..., None]
-    planes = [image.rgb[..., c] if c < 3 else image.alpha for c in channels]
-    return planes[0][..., None] if len(planes) == 1 else np.stack(planes, axis=-1)
-
-
-def _converted(pixels: Floats, space: str) -> Floats:
-    """Linear pixels [h, w, 3 or 4] of a colour space as Rec.709; fewer channels are no colour."""
-    if pixels.shape[2] < 3:
-        return pixels
-    primaries = color_space(space)
-    if primaries is None or space == "sRGB":
-        return pixels
-    rgb = np.maximum(np.asarray(pixels[..., :3], np.float32) @ between(primaries, None).T.astype(np.float32), 0.0)
-    return np.concatenate([rgb, pixels[..., 3:]], axis=-1)
 
 
 def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> Place:

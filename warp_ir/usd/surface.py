@@ -13,9 +13,11 @@ from pxr import Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
+from warp_ir.usd.images import Images
 from warp_ir.usd.light import BRIGHTEST
-from warp_ir.usd.network import Images, Network, Place, Signal, as_color, combine, constant
+from warp_ir.usd.network import Network
 from warp_ir.usd.report import Unreadable
+from warp_ir.usd.signal import Place, Signal, as_color, combine, constant
 
 _GREY: Color = (0.18, 0.18, 0.18)
 _BLACK: Color = (0.0, 0.0, 0.0)
