@@ -347,6 +347,124 @@ def test_primvars_as_colours(tmp_path, interpolation):
     assert scene.materials[two.material[0]].albedo == (0.25, 0.5, 0.75)
 
 
+def painted(nodes, primvars, inputs="color3f inputs:base_color.connect = </A/C.outputs:out>", name="standard_surface"):
+    """A MaterialX surface with nodes that read primvars, on two meshes: one has the primvars."""
+    text = material_text(inputs, shader=f"ND_{name}_surfaceshader", output="mtlx:surface").rstrip()[:-1]
+    return text + "\n" + nodes + "}\n" + mesh(primvars) + mesh("", "N")
+
+
+def reader(name, kind, fallback=0.25):
+    value = {"float": f"{fallback}", "color3": f"({fallback}, {fallback}, {fallback})"}[kind]
+    usd = {"float": "float", "color3": "color3f"}[kind]
+    return f"""
+    def Shader "{name}" {{
+        uniform token info:id = "ND_geompropvalue_{kind}"
+        string inputs:geomprop = "{name}"
+        {usd} inputs:default = {value}
+        {usd} outputs:out
+    }}
+"""
+
+
+def test_arithmetic_on_primvars(tmp_path):
+    """What nodes make of primvars is what the surface has, of one value or of many, of one primvar or of several."""
+    nodes = (
+        reader("r", "float")
+        + reader("g", "float")
+        + """
+    def Shader "B" {
+        uniform token info:id = "ND_multiply_float"
+        float inputs:in1.connect = </A/g.outputs:out>
+        float inputs:in2 = 0.5
+        float outputs:out
+    }
+    def Shader "C" {
+        uniform token info:id = "ND_combine3_color3"
+        float inputs:in1.connect = </A/r.outputs:out>
+        float inputs:in2.connect = </A/g.outputs:out>
+        float inputs:in3.connect = </A/B.outputs:out>
+        color3f outputs:out
+    }
+"""
+    )
+    vertices = "float[] primvars:r = [0, 0.1, 0.2, 0.3, 0.4, 0.5] (interpolation = 'vertex')"
+    half = "float inputs:base = 0.5\n color3f inputs:base_color.connect = </A/C.outputs:out>"
+    scene = load(tmp_path, painted(nodes, f"{vertices}\n float primvars:g = 0.75", half))
+    one, two = scene.meshes
+    expected = np.stack(np.broadcast_arrays(0.1 * one.triangles, 0.75, 0.375), axis=-1) * 0.5
+    np.testing.assert_allclose(one.colors, expected, atol=1e-6)
+    assert scene.materials[two.material[0]].albedo == pytest.approx((0.125, 0.125, 0.0625))
+    scene = load(tmp_path, painted(nodes, "float primvars:r = 1\n float primvars:g = 0.75", half))
+    assert scene.meshes[0].colors is None
+    assert scene.materials[scene.meshes[0].material[0]].albedo == pytest.approx((0.5, 0.375, 0.1875))
+    assert not warned(scene, "primvar")
+
+
+def test_primvars_under_a_coat_and_of_metals(tmp_path):
+    """A coat tints a primvar, and a strictly black metal keeps its part of it."""
+    inputs = """color3f inputs:base_color.connect = </A/C.outputs:out>
+        float inputs:base = 1
+        float inputs:coat = 1
+        color3f inputs:coat_color = (0.5, 1, 1)
+        float inputs:metalness = 0.75"""
+    text = painted(reader("C", "color3"), "color3f primvars:C = (0.5, 0.5, 0.25)", inputs)
+    scene = load(tmp_path, text, metals="black")
+    assert scene.materials[scene.meshes[0].material[0]].albedo == pytest.approx((0.0625, 0.125, 0.0625))
+    assert scene.materials[scene.meshes[1].material[0]].albedo == pytest.approx((0.03125, 0.0625, 0.0625))
+
+
+def test_an_image_times_a_primvar_is_named(tmp_path, image):
+    """The image counts as its mean on surfaces that have the primvar, and is seen on the others."""
+    nodes = (
+        reader("p", "color3", 1.0)
+        + """
+    def Shader "I" {
+        uniform token info:id = "ND_image_color3"
+        asset inputs:file = @a.png@
+        color3f outputs:out
+    }
+    def Shader "C" {
+        uniform token info:id = "ND_multiply_color3"
+        color3f inputs:in1.connect = </A/I.outputs:out>
+        color3f inputs:in2.connect = </A/p.outputs:out>
+        color3f outputs:out
+    }
+"""
+    )
+    base = "float inputs:base = 1\n color3f inputs:base_color.connect = </A/C.outputs:out>"
+    scene = load(tmp_path, painted(nodes, "color3f[] primvars:p = [(0.5, 0.25, 0)]", base))
+    one, two = (scene.materials[m.material[0]] for m in scene.meshes)
+    mean = srgb_to_linear(image[..., :3]).mean(axis=(0, 1))
+    assert one.albedo_texture is None and one.albedo == pytest.approx(mean * (0.5, 0.25, 0), rel=1e-3)
+    assert two.albedo_texture is not None and two.albedo == pytest.approx(mean, rel=1e-3)
+    assert warned(scene, "/A", "counts as its mean")
+
+
+@pytest.mark.parametrize(
+    "name, weight, scattered, sheen",
+    [
+        ("standard_surface", "subsurface", "subsurface_color", "sheen"),
+        ("open_pbr_surface", "subsurface_weight", "subsurface_color", "fuzz_weight"),
+    ],
+)
+def test_subsurface_and_sheen(tmp_path, name, weight, scattered, sheen):
+    """Scattering below the surface counts as diffuse reflection of its colour; sheen is named; metals have neither."""
+    base = "base" if name == "standard_surface" else "base_weight"
+    metal = "metalness" if name == "standard_surface" else "base_metalness"
+    inputs = f"""float inputs:{base} = 1
+        color3f inputs:base_color = (0.5, 0.5, 0.5)
+        float inputs:{weight} = 0.25
+        color3f inputs:{scattered} = (0.9, 0.1, 0.5)
+        float inputs:{sheen} = 1
+        """
+    text = material_text(inputs, shader=f"ND_{name}_surfaceshader", output="mtlx:surface") + mesh("")
+    scene = load(tmp_path, text)
+    assert only_material(scene).albedo == pytest.approx((0.6, 0.4, 0.5))
+    assert warned(scene, "/A", "subsurface", "diffuse") and warned(scene, "/A", "sheen is not rendered")
+    scene = load(tmp_path, text.replace(f"float inputs:{sheen}", f"float inputs:{metal}"))
+    assert only_material(scene).albedo == pytest.approx((0.5, 0.5, 0.5)) and not warned(scene, "sheen")
+
+
 MATERIALX = """
     def Shader "I" {
         uniform token info:id = "ND_%s"

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,22 @@ from warp_ir.scene import Floats, Texture, Wrap
 from warp_ir.usd import value
 from warp_ir.usd.images import Images
 from warp_ir.usd.report import Unreadable
-from warp_ir.usd.signal import Place, Signal, as_color, combine, constant, select
+from warp_ir.usd.signal import Place, Primvar, Signal, as_color, combine, constant, from_primvar, select
 
 _DEPTH = 32
 """Longest chain of nodes that is followed."""
 _NODE_BUDGET = 256
 """Most nodes that one input may need: shared nodes count every time they are used."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
+_READERS = {"UsdPrimvarReader": ("varname", "fallback"), "geompropvalue": ("geomprop", "default")}
+"""Nodes that read primvars: their inputs for its name, and for the value where there is none."""
+_CHANNELS = {
+    **dict.fromkeys(("float", "int", "integer"), 1),
+    **dict.fromkeys(("float2", "vector2"), 2),
+    **dict.fromkeys(("float3", "vector3", "color3", "normal", "point", "vector"), 3),
+    **dict.fromkeys(("float4", "vector4", "color4"), 4),
+}
+"""Of what they read."""
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
 
 
@@ -77,12 +85,12 @@ class Network:
         name = identifier.removeprefix("ND_")
         if name in ("UsdUVTexture", "UsdUVTexture_23"):
             return self._uv_texture(node, output, default)
-        if name.startswith("UsdPrimvarReader_"):
-            fallback = self._input(node.GetInput("fallback"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
-            return replace(fallback, primvar=self._text(node.GetInput("varname")))
-        if name.startswith("geompropvalue_"):
-            fallback = self._input(node.GetInput("default"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
-            return replace(fallback, primvar=self._text(node.GetInput("geomprop")))
+        reader, _, kind = name.partition("_")
+        if reader in _READERS and kind in _CHANNELS:
+            named, otherwise = _READERS[reader]
+            primvar = Primvar(self._text(node.GetInput(named)), _CHANNELS[kind])
+            fallback = self._input(node.GetInput(otherwise), constant(*[0.0] * primvar.channels), depth - 1)
+            return from_primvar(primvar, fallback)
         if identifier.startswith("ND_"):
             if name.startswith(("image_", "tiledimage_")):
                 return self._image(node, name)
@@ -95,10 +103,7 @@ class Network:
         """MaterialX's arithmetic; None if the node is none."""
 
         def get(key: str, *default: float) -> Signal:
-            found = self._input(node.GetInput(key), constant(*default), depth)
-            if found.primvar:
-                self.warn(f"arithmetic on the primvar '{found.primvar}' is not read: it counts as its fallback")
-            return replace(found, primvar="")
+            return self._input(node.GetInput(key), constant(*default), depth)
 
         kind = name.split("_")[0]
         if kind == "constant":
@@ -250,7 +255,10 @@ class Network:
 
     def _constant(self, node: UsdShade.Shader, name: str, default: list[float]) -> Floats:
         """An input's numbers, float64 [c]; a network's are averaged."""
-        found = self._input(node.GetInput(name), constant(*default), 2).mean
+        signal = self._input(node.GetInput(name), constant(*default), 2)
+        if signal.primvars:
+            self.warn(f"{name} reads the primvar '{signal.primvars[0].name}': it takes the reader's fallback")
+        found = signal.mean
         return found if len(found) == len(default) else np.resize(found, len(default))
 
     def _text(self, shader_input: UsdShade.Input, default: str = "") -> str:

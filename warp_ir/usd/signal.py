@@ -5,7 +5,7 @@ renders for nothing. Two images that lie in the same place are combined pixel by
 counts as its mean.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,18 @@ class Place:
     wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
 
 
+@dataclass(frozen=True)
+class Primvar:
+    """Values that a surface may have at its corners."""
+
+    name: str
+    channels: int
+
+
+PrimvarValues = Mapping[Primvar, Floats]
+"""Those that a surface has, float [c] where they are the same everywhere, or [m, 3, c]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Signal:
     """What comes out of a network."""
@@ -38,13 +50,27 @@ class Signal:
     """Equal where the content is."""
     name: str = ""
     """Of the image."""
-    primvar: str = ""
-    """Read from the surface's primvar of this name; `pixels` is the value where it has none."""
+    primvars: tuple[Primvar, ...] = ()
+    """What it depends on besides; `pixels` is the value where surfaces have none of them."""
+    of: Callable[[PrimvarValues], Floats] | None = None
+    """Its value, given those primvars that a surface has; images count as their means."""
 
     @property
     def mean(self) -> Floats:
         """Over the pixels, float64 [c]."""
         return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
+
+    def at(self, values: PrimvarValues) -> Floats:
+        """Its value on a surface, [c] or [m, 3, c]."""
+        return self.mean if self.of is None else self.of(values)
+
+
+def from_primvar(primvar: Primvar, fallback: Signal) -> Signal:
+    """A surface's primvar, or a constant where it has none."""
+    without = np.resize(fallback.mean, primvar.channels)
+    return replace(
+        constant(*without.tolist()), primvars=(primvar,), of=lambda values: values.get(primvar, without), key=primvar
+    )
 
 
 def constant(*channels: float) -> Signal:
@@ -63,9 +89,11 @@ def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> 
     """
     images = [s for s in signals if s.place is not None]
     key = (label, *(s.key for s in signals))
+    primvars = tuple(dict.fromkeys(p for s in signals for p in s.primvars))
+    of = (lambda values: _finite(function(*(s.at(values) for s in signals)))) if primvars else None
     if not images:
         made = _finite(function(*(s.pixels for s in signals)))
-        return Signal(made, made[0, 0], None, key)
+        return Signal(made, made[0, 0], None, key, "", primvars, of)
     first = images[0]
     together = [s for s in images if s.place == first.place]
     height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
@@ -80,7 +108,7 @@ def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> 
             outside.append(s.outside)
     made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
     made = np.broadcast_to(made, (height, width, made.shape[-1]))
-    return Signal(compact(made), _finite(function(*outside)), first.place, key, first.name)
+    return Signal(compact(made), _finite(function(*outside)), first.place, key, first.name, primvars, of)
 
 
 def _finite(values: Floats) -> Floats:
@@ -91,7 +119,8 @@ def _finite(values: Floats) -> Floats:
 def select(signal: Signal, channels: list[int]) -> Signal:
     """Some channels, in any order."""
     pixels, outside = signal.pixels[..., channels], np.asarray(signal.outside)[channels]
-    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key))
+    of = None if signal.of is None else lambda values: signal.at(values)[..., channels]
+    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key), of=of)
 
 
 def as_color(signal: Signal) -> Signal:

@@ -29,8 +29,8 @@ class Surface:
     """What a material looks like."""
 
     material: Material
-    primvar: str = ""
-    """Where surfaces have a primvar of this name, it is their albedo."""
+    albedo: Signal | None = None
+    """If it depends on primvars: what the albedo is where surfaces have them."""
 
 
 def read_material(
@@ -77,16 +77,11 @@ class _Inputs:
 
     def color(self, name: str, default: Color) -> Signal:
         """A colour."""
-        found = self.network.evaluate(self._shader.GetInput(name), constant(*default))
-        if found.primvar and name not in ("diffuseColor", "base_color"):
-            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
-        return as_color(found)
+        return as_color(self.network.evaluate(self._shader.GetInput(name), constant(*default)))
 
     def grey(self, name: str, default: float) -> Signal:
         """One channel."""
         found = self.network.evaluate(self._shader.GetInput(name), constant(default))
-        if found.primvar:
-            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
 
     def normal(self, name: str, *, tangent: bool) -> Signal | None:
@@ -107,8 +102,7 @@ class _Inputs:
                 self.warn(f"{name}: only a normalmap is read, not {node}; the surface's own normals are used")
                 return None
         found = as_color(self.network.evaluate(self._shader.GetInput(name), constant(0.0, 0.0, 1.0)))
-        if found.primvar:
-            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
+        self.without_primvars(name, found)
         if np.abs(found.pixels).max() > 1.0:
             found = combine("normal", lambda n: np.clip(n, -1.0, 1.0), found)
         x, y, z = found.mean.tolist()
@@ -119,6 +113,11 @@ class _Inputs:
         # Beyond an image that ends, the surface is smooth.
         return replace(found, outside=np.array([0.0, 0.0, 1.0]), key=("normal", found.key))
 
+    def without_primvars(self, what: str, signal: Signal) -> None:
+        """Name the primvars that count as their readers' fallbacks."""
+        for primvar in signal.primvars:
+            self.warn(f"{what} reads the primvar '{primvar.name}': it takes the reader's fallback")
+
     def unread(self, *names: str) -> None:
         """Name the inputs that are authored in vain."""
         for name in names:
@@ -126,9 +125,17 @@ class _Inputs:
             if given is not None and UsdShade.Output.IsOutput(given):
                 self.warn(f"{name} is not rendered ({{n}} materials)")
 
+    def unrendered(self, name: str, what: str) -> None:
+        """Say that something is not rendered, if its weight is not 0."""
+        weight = self.grey(name, 0.0)
+        if weight.pixels.max() > 0.0 or weight.primvars:
+            self.warn(f"{what} is not rendered ({{n}} materials)")
+
     def number(self, name: str, default: float) -> float:
         """A number; the mean where it comes from an image."""
-        return float(self.grey(name, default).mean[0])
+        found = self.grey(name, default)
+        self.without_primvars(name, found)
+        return float(found.mean[0])
 
 
 def _mean_channel(pixels: Floats) -> Floats:
@@ -157,7 +164,9 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
+    albedo = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
     albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
+    inputs.unrendered("sheen", "sheen")
     return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False))
 
 
@@ -167,7 +176,9 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
+    albedo = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
     albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
+    inputs.unrendered("fuzz_weight", "sheen")
     opacity, normal = inputs.grey("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
     return _surface(inputs, albedo, emission, opacity, 0.0, normal)
 
@@ -185,7 +196,7 @@ def _unit(pixels: Floats) -> Floats:
 
 
 def _scaled(color: Signal, weight: Signal) -> Signal:
-    if weight.place is None and weight.mean[0] == 1.0:
+    if weight.place is None and not weight.primvars and weight.mean[0] == 1.0:
         return color
     return combine("scaled", np.multiply, color, weight)
 
@@ -193,7 +204,7 @@ def _scaled(color: Signal, weight: Signal) -> Signal:
 def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
     """The albedo of a surface that may be a metal, of which only its base colour is left, or nothing."""
     metallic = inputs.grey(name, 0.0)
-    if metallic.pixels.max() <= 0.0:
+    if metallic.pixels.max() <= 0.0 and not metallic.primvars:
         return albedo
     if not inputs.black_metals:
         inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
@@ -202,16 +213,31 @@ def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
     return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
 
 
+def _scattering(inputs: _Inputs, weight: str, metalness: str, default: Color, albedo: Signal) -> Signal:
+    """The albedo of a surface of which a part scatters light below it: as reflected from its colour, where it entered.
+
+    Metals let no light in.
+    """
+    share = inputs.grey(weight, 0.0)
+    if share.pixels.max() <= 0.0 and not share.primvars:
+        return albedo
+    inputs.warn("subsurface scattering rendered as diffuse reflection ({n} materials)")
+
+    def mixed(base: Floats, color: Floats, part: Floats, metal: Floats) -> Floats:
+        part = _unit(part) * (1.0 - _unit(metal))
+        return np.asarray(base * (1.0 - part) + color * part)
+
+    color = inputs.color("subsurface_color", default)
+    return combine("subsurface", mixed, albedo, color, share, inputs.grey(metalness, 0.0))
+
+
 def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
     """The albedo below a coat, whose colour filters what comes back: lacquered metals get theirs from it."""
     coat = inputs.grey(weight, 0.0)
-    if coat.pixels.max() <= 0.0:
+    if coat.pixels.max() <= 0.0 and not coat.primvars:
         return albedo
     tint = inputs.color("coat_color", _WHITE)
-    if tint.pixels.min() >= 1.0:
-        return albedo
-    if albedo.primvar:
-        inputs.warn(f"coat_color does not tint the primvar '{albedo.primvar}'")
+    if tint.pixels.min() >= 1.0 and not tint.primvars:
         return albedo
     return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _unit(t))), albedo, coat, tint)
 
@@ -223,6 +249,8 @@ def _surface(
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _unit, albedo)
+    inputs.without_primvars("emission", emission)
+    inputs.without_primvars("opacity", opacity)
     if float(emission.pixels.max()) >= BRIGHTEST:
         inputs.warn(f"emission {_numbers(emission)} is beyond reason; it emits nothing")
         emission = constant(*_BLACK)
@@ -254,7 +282,7 @@ def _surface(
         network.texture(_bounded(opacity)) if textured else None,
         None if normal is None else network.texture(normal),
     )
-    return Surface(material, albedo.primvar)
+    return Surface(material, albedo if albedo.primvars else None)
 
 
 def _bounded(signal: Signal) -> Signal:
