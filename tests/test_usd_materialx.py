@@ -150,6 +150,22 @@ def Xform "B" (
     assert [m.albedo for m in packed.materials] == [m.albedo for m in scene.materials]
 
 
+def test_from_a_session_layer_and_under_a_mask(looks):
+    """A session layer refers to a document as any other; what a layer says beside it, odd paths too, stays."""
+    paint = f"(subLayers = [@looks.mtlx@])\n{mesh().replace('def Mesh', 'over')}asset odd = @[[[::@\n"
+    (looks / "session.usda").write_text("#usda 1.0\n" + paint.replace("asset odd", 'def "X" {\nasset odd') + "}\n")
+    text = f'def Mesh "M" {{{QUADS}}}\ndef Mesh "N" {{{QUADS}}}\n'
+    scene = load(looks, text, session_layer=looks / "session.usda", mask=["/M"])
+    assert only_material(scene).albedo == pytest.approx((0.25, 0.5, 0.75)) and len(scene.meshes) == 1
+
+
+def test_the_colour_space_of_a_document(looks):
+    """The numbers of a document are in its colour space: this is Rec. 709's red in ACEScg."""
+    text = DOCUMENT.replace('colorspace="lin_rec709"', 'colorspace="acescg"')
+    (looks / "looks.mtlx").write_text(text.replace("0.25, 0.5, 0.75", "0.613097, 0.070194, 0.020616"))
+    assert only_material(load(looks, ROOT + mesh())).albedo == pytest.approx((1.0, 0.0, 0.0), abs=1e-5)
+
+
 def test_what_others_share_is_left_alone(looks):
     """Layers on the disk, and those that the process has open, are as they were."""
     (looks / "stage.usda").write_text("#usda 1.0\n" + ROOT + mesh())
@@ -205,6 +221,7 @@ def test_bad_documents_are_named(tmp_path, words):
     (tmp_path / "looks.mtlx").write_text(BAD[words])
     scene = load(tmp_path, ROOT + mesh())
     assert warned(scene, "/: MaterialX document", "looks.mtlx", words) and scene.triangle_count == 4
+    assert not warned(scene, "composition")
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def with_documents(stage: Usd.Stage, report: Report) -> tuple[Sdf.Layer, ...]:
     if not available():
         report.warn("/", f"{len(wanted)} .mtlx files cannot be read: the package MaterialX is not installed")
         return ()
-    documents = {path: layer for path in sorted(wanted) if (layer := _read(path, report)) is not None}
+    documents = {path: _read(path, report) for path in sorted(wanted)}
     copies: _Layers = {}
     while True:
         known = documents.keys() | copies.keys()
@@ -44,7 +44,7 @@ def with_documents(stage: Usd.Stage, report: Report) -> tuple[Sdf.Layer, ...]:
         ]
         if not new:
             break
-        copies |= {layer.identifier: Sdf.Layer.CreateAnonymous(f"{layer.GetDisplayName()}.usda") for layer in new}
+        copies |= {layer.identifier: Sdf.Layer.CreateAnonymous(_tag(layer)) for layer in new}
     session, root = stage.GetSessionLayer(), stage.GetRootLayer()
     copies[session.identifier] = session
     for layer in used:
@@ -65,7 +65,14 @@ def _identifier(layer: Sdf.Layer, path: str) -> str:
     """The identifier of the layer that a path in another one leads to."""
     try:
         found = Sdf.Layer.FindRelativeToLayer(layer, path)
-        return str(found.identifier if found else layer.ComputeAbsolutePath(path))
+    except Tf.ErrorException:
+        found = None
+    return str(found.identifier) if found else _absolute(layer, path)
+
+
+def _absolute(layer: Sdf.Layer, path: str) -> str:
+    try:
+        return str(layer.ComputeAbsolutePath(path))
     except Tf.ErrorException:
         return path
 
@@ -77,9 +84,9 @@ def _led(layer: Sdf.Layer, elsewhere: _Layers, path: str) -> str:
     found = elsewhere.get(_identifier(layer, path))
     if found is not None:
         return str(found.identifier)
-    absolute = str(layer.ComputeAbsolutePath(path))
+    absolute = _absolute(layer, path)
     # A name that is searched for, and not found, may be a pattern: images by tiles lie beside the layer.
-    return str(layer.ComputeAbsolutePath(f"./{path}")) if absolute == path and "<UDIM>" in path else absolute
+    return _absolute(layer, f"./{path}") if absolute == path and "<UDIM>" in path else absolute
 
 
 def _is_mtlx(path: str) -> bool:
@@ -87,13 +94,22 @@ def _is_mtlx(path: str) -> bool:
     return (Ar.SplitPackageRelativePathInner(path)[1] or path).lower().endswith(".mtlx")
 
 
-def _read(path: str, report: Report) -> Sdf.Layer | None:
+def _tag(layer: Sdf.Layer) -> str:
+    """The name of a copy, of which the extension decides the format: packages cannot be made."""
+    name = str(layer.GetDisplayName())
+    return name if name.endswith((".usda", ".usdc", ".usd")) else f"{name}.usda"
+
+
+def _read(path: str, report: Report) -> Sdf.Layer:
     """The layer of a document; an empty one, and a line, if it cannot be read."""
     try:
         layer, left_out = materialx_layer(path)
     except Unreadable as trouble:
         report.warn("/", f"MaterialX document {path}: {trouble}")
-        return None
+        empty = Sdf.Layer.CreateAnonymous("empty.usda")
+        Sdf.CreatePrimInLayer(empty, "/MaterialX/Materials")
+        empty.defaultPrim = "MaterialX"
+        return empty
     for what in left_out:
         report.warn("/", f"MaterialX document {path}: {what}")
     return layer

@@ -167,5 +167,6 @@ def first_message(error: Exception) -> str:
 
 
 def _tidy(message: str) -> str:
-    words = " ".join(message.split())
+    # Layers in memory are called by where they lie there, and by their name.
+    words = re.sub(r"anon:0x[0-9a-fA-F]+:", "", " ".join(message.split()))
     return words if len(words) <= 300 else words[:299] + "…"
