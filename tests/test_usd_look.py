@@ -163,6 +163,18 @@ def test_constant_normals(tmp_path, value, expected):
         assert texture.pixels == pytest.approx(np.reshape(expected, (1, 1, 3)), abs=1e-3) and texture.uv == "st"
 
 
+def test_colour_spaces_are_for_colours(tmp_path):
+    """A prim's colour space does not turn vectors: normals, and primvars of numbers, are what they are."""
+    api = '(prepend apiSchemas = ["ColorSpaceAPI"])'
+    text = material_text("normal3f inputs:normal = (0.6, 0, 0.8)\n color3f inputs:diffuseColor = (0.5, 0.5, 0)")
+    text = text.replace(
+        'def Material "A" {', f'def Material "A" {api} {{\n uniform token colorSpace:name = "lin_ap1_scene"'
+    )
+    material = only_material(load(tmp_path, text + mesh()))
+    assert material.normal_texture.pixels == pytest.approx(np.reshape((0.6, 0.0, 0.8), (1, 1, 3)), abs=1e-6)
+    assert material.albedo != pytest.approx((0.5, 0.5, 0.0), abs=0.01)
+
+
 NORMALMAP = """
     def Shader "N" {
         uniform token info:id = "ND_normalmap_float"

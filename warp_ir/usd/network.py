@@ -74,7 +74,7 @@ class Network:
                 what = "a finite colour" if array.shape == (3,) else "a finite number"
                 raise Unreadable(f"{attribute.GetName()} is {_short(channels)}, not {what}")
             array = np.atleast_1d(array).astype(np.float64)
-            if len(array) == 3:
+            if len(array) == 3 and value.is_color(attribute):
                 array = value.to_linear_rec709(attribute, array.reshape(1, 3))[0]
             return constant(*array.tolist())
         self._nodes += 1

@@ -60,7 +60,7 @@ def corner_values(
         values = _rows(found.GetAttr(), time, channels)
         if values is None or len(values) == 0:
             return None
-        if channels >= 3:
+        if channels >= 3 and value.is_color(found.GetAttr()):
             rgb = value.to_linear_rec709(found.GetAttr(), values[:, :3])
             values = np.concatenate([rgb, values[:, 3:]], axis=1)
         indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None

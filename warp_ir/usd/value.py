@@ -126,6 +126,11 @@ def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
         raise Unreadable(f"{attribute.GetName()} has the {trouble}") from None
 
 
+def is_color(attribute: Usd.Attribute) -> bool:
+    """Whether an attribute of three numbers holds a colour, and not a vector, which no colour space is for."""
+    return bool(attribute.GetRoleName() == Sdf.ValueRoleNames.Color or attribute.HasColorSpace())
+
+
 def targets(relationship: Usd.Relationship) -> list[Sdf.Path]:
     """What a relationship points to; nothing where it is absent, or is no relationship in the file."""
     try:
