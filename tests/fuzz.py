@@ -10,7 +10,7 @@ import traceback
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender, UsdShade, UsdSkel, UsdUtils
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes_usd"
 MEMORY = 8 << 30
@@ -32,6 +32,39 @@ def seeds(folder: Path) -> list[Path]:
     return found
 
 
+def _paint(stage: Usd.Stage) -> UsdShade.Material:
+    """A MaterialX surface: nodes that compute with a primvar, a normal map, scattering, a wide gamut."""
+    material = UsdShade.Material.Define(stage, "/Looks/Paint")
+
+    def node(name: str, kind: str, **inputs: object) -> UsdShade.ConnectableAPI:
+        shader = UsdShade.Shader.Define(stage, f"/Looks/Paint/{name}")
+        shader.CreateIdAttr(kind)
+        for key, given in inputs.items():
+            number = isinstance(given, float)
+            made = shader.CreateInput(key, Sdf.ValueTypeNames.Float if number else Sdf.ValueTypeNames.Color3f)
+            if isinstance(given, UsdShade.ConnectableAPI):
+                made.ConnectToSource(given, "out")
+            else:
+                made.Set(given)
+        return shader.ConnectableAPI()
+
+    color = node("Read", "ND_geompropvalue_color3", default=Gf.Vec3f(0.5))
+    color.GetPrim().CreateAttribute("inputs:geomprop", Sdf.ValueTypeNames.String).Set("displayColor")
+    color.GetInput("default").GetAttr().SetColorSpace("lin_ap1_scene")
+    mixed = node("Mix", "ND_mix_color3", fg=color, bg=Gf.Vec3f(0.25), mix=0.5)
+    normal = {"in": Gf.Vec3f(0.75, 0.5, 1.0), "scale": 0.5}
+    surface = node(
+        "Surface",
+        "ND_standard_surface_surfaceshader",
+        base=0.75,
+        base_color=mixed,
+        subsurface=0.25,
+        normal=node("Bumps", "ND_normalmap_float", **normal),
+    )
+    material.CreateSurfaceOutput("mtlx").ConnectToSource(surface, "surface")
+    return material
+
+
 def rich_stage(path: Path) -> Path:
     """A stage with one of everything that is read: what a mutation of it breaks, some reader has to notice."""
     stage = Usd.Stage.CreateNew(str(path))
@@ -45,6 +78,10 @@ def rich_stage(path: Path) -> Path:
     shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(1.0))
     shader.CreateInput("opacity", Sdf.ValueTypeNames.Float).Set(1.0)
     material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    paint = _paint(stage)
+    settings = UsdRender.Settings.Define(stage, "/Render")
+    settings.CreateMaterialBindingPurposesAttr(["preview", "full", ""])
+    settings.CreateRenderingColorSpaceAttr("lin_ap1_scene")
     for k, scheme in enumerate(("none", "catmullClark", "loop", "bilinear")):
         mesh = UsdGeom.Mesh.Define(stage, f"/World/Mesh{k}")
         mesh.CreatePointsAttr([(x, y, 0.1 * x * y) for x in range(4) for y in range(4)])
@@ -65,6 +102,7 @@ def rich_stage(path: Path) -> Path:
         color.SetIndices([i % 4 for i in range(36)])
         uv = api.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex")
         uv.Set([(x / 3, y / 3) for x in range(4) for y in range(4)])
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(paint, materialPurpose="preview")
         subset = UsdGeom.Subset.CreateGeomSubset(mesh, "Part", "face", [0, 1], "materialBind")
         UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
     tets = UsdGeom.TetMesh.Define(stage, "/World/Tets")

@@ -14,7 +14,7 @@ PACKAGE = Path(ir.__file__).parent
 
 # Lowest first: a module may import from its own layer's left and from the layers before it.
 LAYERS = [
-    ["placing"],
+    ["placing", "color_space"],
     ["scene"],
     ["settings", "tonemap", "metrics", "denoise", "mipmap", "cost"],
     ["profiling"],

@@ -5,9 +5,12 @@ import subprocess
 import sys
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
+from pxr import Gf
 
 from warp_ir import InputError, RenderSettings
+from warp_ir.color_space import COLOR_SPACES, REC709, matrix
 from warp_ir.image import AOV_CHANNELS, check_output, read_image, whole_file, write_image
 from warp_ir.tonemap import srgb_from_linear
 
@@ -91,6 +94,41 @@ def test_exr_attributes(tmp_path, film):
     assert found["warp_ir:width"] == WIDTH and found["warp_ir:iterations"] == 3
     assert found["warp_ir:estimated_error"] == 0.25 and found["warp_ir:stage"] == "room.usda"
     assert found["warp_ir:big"] == 2.0**40 and "warp_ir:camera" not in found
+
+
+@pytest.mark.parametrize("name", list(COLOR_SPACES))
+def test_colour_spaces_are_usds(name):
+    """The matrices are those of GfColorSpace, and white stays white."""
+    ours, theirs = Gf.ColorSpace(name), Gf.ColorSpace(REC709)
+    expected = [ours.Convert(theirs, Gf.Vec3f(*axis)).GetRGB() for axis in np.eye(3).tolist()]
+    np.testing.assert_allclose(matrix(name).T, expected, atol=1e-6)
+    np.testing.assert_allclose(matrix(name) @ np.ones(3), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".npy"])
+def test_linear_pictures_in_another_colour_space(tmp_path, film, suffix):
+    """The film's settings decide; colours are converted, in layers too, and other values are not."""
+    film.settings = RenderSettings(width=WIDTH, height=HEIGHT, color_space="lin_ap1_scene")
+    write_image(tmp_path / f"a{suffix}", film, half=False, aovs=("albedo", "normal") if suffix == ".exr" else ())
+    known = np.array([[0.613097, 0.339523, 0.047379], [0.070194, 0.916354, 0.013452], [0.020616, 0.109570, 0.869815]])
+    stored = read_image(tmp_path / f"a{suffix}")[..., :3]
+    np.testing.assert_allclose(stored, film.radiance() @ known.T, atol=1e-5 if suffix != ".hdr" else 0.01)
+    if suffix == ".exr":
+        layers = [read_image(tmp_path / "a.exr", name) for name in ("albedo", "normal")]
+        np.testing.assert_allclose(layers[0], film.aov("albedo") @ known.T, atol=1e-5)
+        np.testing.assert_array_equal(layers[1], film.aov("normal"))
+        spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
+        assert spec.getattribute("chromaticities") == pytest.approx(COLOR_SPACES["lin_ap1_scene"])
+
+
+def test_screens_show_the_same_in_any_colour_space(tmp_path, film):
+    """A .png is sRGB; the argument is stronger than the settings, and has to be a name."""
+    for name in (REC709, "lin_ap1_scene"):
+        write_image(tmp_path / f"{name}.png", film, color_space=name)
+    one, other = (read_image(tmp_path / f"{name}.png") for name in (REC709, "lin_ap1_scene"))
+    np.testing.assert_array_equal(one, other)
+    with pytest.raises(InputError, match="no colour space 'crayon'; known are lin_rec709_scene"):
+        write_image(tmp_path / "a.exr", film, color_space="crayon")
 
 
 def test_other_formats_put_aovs_beside(tmp_path, film):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdUtils
 
 import warp_ir as ir
 from tests.test_usd_material import QUADS, load, material_text, only_material, warned
@@ -118,6 +118,93 @@ def test_a_linear_wide_gamut_is_converted(tmp_path):
     text = textured(file="a.exr").replace("@a.exr@", '@a.exr@ (colorSpace = "lin_ap1_scene")')
     pixels = only_material(load(tmp_path, text + mesh())).albedo_texture.pixels
     np.testing.assert_allclose(pixels[0, 0], (1.0, 0.0, 0.0), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["lin_ap1_scene", "g22_rec709_scene", "srgb_p3d65_scene", "lin_rec2020", "acescg"])
+def test_colour_spaces_by_name(tmp_path, image, name):
+    """The node may name any of USD's spaces: the picture is what USD converts its colours to, cut at 0."""
+    texture = only_material(
+        load(tmp_path, textured(f'token inputs:sourceColorSpace = "{name}"') + mesh())
+    ).albedo_texture
+    known = {"lin_rec2020": "lin_rec2020_scene", "acescg": "lin_ap1_scene"}
+    source, target = Gf.ColorSpace(known.get(name, name)), Gf.ColorSpace("lin_rec709_scene")
+    expected = [target.Convert(source, Gf.Vec3f(*rgb)).GetRGB() for rgb in image[..., :3].reshape(-1, 3).tolist()]
+    expected = np.clip(np.reshape(expected, (2, 3, 3)), 0.0, 1.0)
+    np.testing.assert_allclose(texture.pixels, expected, atol=2.0**-10)
+
+
+def test_an_unknown_colour_space_is_named(tmp_path, image):
+    scene = load(tmp_path, textured('token inputs:sourceColorSpace = "crayon"') + mesh())
+    assert warned(scene, "/A: inputs:file", "unknown colour space 'crayon'")
+
+
+UNPACK = "float4 inputs:scale = (2, 2, 2, 1)\n float4 inputs:bias = (-1, -1, -1, 0)"
+RAW = 'token inputs:sourceColorSpace = "raw"'
+
+
+def test_a_normal_map(tmp_path):
+    """The pixels of a normal map are vectors: 128/127.5 - 1 of a byte; beyond the image the surface is smooth."""
+    pixels = np.uint8([[[0, 128, 255], [255, 128, 128]]])
+    write(tmp_path / "a.png", pixels)
+    scene = load(tmp_path, textured(f"{UNPACK}\n {RAW}", target="normal3f inputs:normal") + mesh())
+    texture = only_material(scene).normal_texture
+    np.testing.assert_allclose(texture.pixels, pixels / 127.5 - 1.0, atol=2.0**-11)
+    assert texture.outside == (0.0, 0.0, 1.0) and not warned(scene, "normal")
+    packed = load(tmp_path, textured(RAW, target="normal3f inputs:normal") + mesh())
+    assert warned(packed, "/A: normal: the map leans to one side")
+
+
+@pytest.mark.parametrize("value, expected", [((0, 0, 1), None), ((0.6, 0, 0.8), (0.6, 0, 0.8)), ((0, 9, 1), (0, 1, 1))])
+def test_constant_normals(tmp_path, value, expected):
+    """One normal everywhere is an image of one texel; straight up is none."""
+    texture = only_material(load(tmp_path, material_text(f"normal3f inputs:normal = {value}") + mesh())).normal_texture
+    assert (texture is None) == (expected is None)
+    if texture is not None:
+        assert texture.pixels == pytest.approx(np.reshape(expected, (1, 1, 3)), abs=1e-3) and texture.uv == "st"
+
+
+def test_colour_spaces_are_for_colours(tmp_path):
+    """A prim's colour space does not turn vectors: normals, and primvars of numbers, are what they are."""
+    api = '(prepend apiSchemas = ["ColorSpaceAPI"])'
+    text = material_text("normal3f inputs:normal = (0.6, 0, 0.8)\n color3f inputs:diffuseColor = (0.5, 0.5, 0)")
+    text = text.replace(
+        'def Material "A" {', f'def Material "A" {api} {{\n uniform token colorSpace:name = "lin_ap1_scene"'
+    )
+    material = only_material(load(tmp_path, text + mesh()))
+    assert material.normal_texture.pixels == pytest.approx(np.reshape((0.6, 0.0, 0.8), (1, 1, 3)), abs=1e-6)
+    assert material.albedo != pytest.approx((0.5, 0.5, 0.0), abs=0.01)
+
+
+NORMALMAP = """
+    def Shader "N" {
+        uniform token info:id = "ND_normalmap_float"
+        float3 inputs:in.connect = </A/I.outputs:out>
+        float inputs:scale = 0.5
+        SPACE
+        float3 outputs:out
+    }
+    def Shader "I" {
+        uniform token info:id = "ND_image_vector3"
+        asset inputs:file = @a.png@
+        float3 outputs:out
+    }
+"""
+
+
+@pytest.mark.parametrize("surface", ["standard_surface", "open_pbr_surface"])
+def test_normal_maps_of_materialx(tmp_path, surface):
+    """The node normalmap unpacks and scales; other vectors are in world space, which images are not."""
+    pixels = np.uint8([[[128, 128, 255], [255, 0, 128]]])
+    write(tmp_path / "a.png", pixels)
+    name = "normal" if surface == "standard_surface" else "geometry_normal"
+    inputs = f"float3 inputs:{name}.connect = </A/N.outputs:out>"
+    text = material_text(inputs, shader=f"ND_{surface}_surfaceshader", output="mtlx:surface").rstrip()[:-1]
+    texture = only_material(load(tmp_path, text + NORMALMAP.replace("SPACE", "") + "}\n" + mesh())).normal_texture
+    np.testing.assert_allclose(texture.pixels, (pixels / 127.5 - 1.0) * (0.5, 0.5, 1.0), atol=2.0**-11)
+    world = text + NORMALMAP.replace("SPACE", 'string inputs:space = "object"') + "}\n" + mesh()
+    assert warned(load(tmp_path, world), "/A", name, "tangent space")
+    image = text.replace("A/N.", "A/I.") + NORMALMAP.replace("SPACE", "") + "}\n" + mesh()
+    assert warned(load(tmp_path, image), "/A", name, "only a normalmap is read")
 
 
 def test_transforms(tmp_path, image):
@@ -235,7 +322,7 @@ def test_images_are_read_once_and_only_where_used(tmp_path, image):
 
 def test_more_pixels_than_the_budget(tmp_path, image, monkeypatch):
     """Images are averaged down, said once, and keep their mean."""
-    monkeypatch.setattr("warp_ir.usd.network.MAX_TEXTURE_PIXELS", 8)
+    monkeypatch.setattr("warp_ir.usd.images.MAX_TEXTURE_PIXELS", 8)
     scene = load(tmp_path, textured('token inputs:sourceColorSpace = "raw"') + mesh())
     assert scene.stats["texels"] <= 4 and warned(scene, "a.png", "averaged down")
 
@@ -270,6 +357,124 @@ def test_primvars_as_colours(tmp_path, interpolation):
     else:
         assert one.colors is None and scene.materials[one.material[0]].albedo == (0.0, 0.5, 0.0)
     assert scene.materials[two.material[0]].albedo == (0.25, 0.5, 0.75)
+
+
+def painted(nodes, primvars, inputs="color3f inputs:base_color.connect = </A/C.outputs:out>", name="standard_surface"):
+    """A MaterialX surface with nodes that read primvars, on two meshes: one has the primvars."""
+    text = material_text(inputs, shader=f"ND_{name}_surfaceshader", output="mtlx:surface").rstrip()[:-1]
+    return text + "\n" + nodes + "}\n" + mesh(primvars) + mesh("", "N")
+
+
+def reader(name, kind, fallback=0.25):
+    value = {"float": f"{fallback}", "color3": f"({fallback}, {fallback}, {fallback})"}[kind]
+    usd = {"float": "float", "color3": "color3f"}[kind]
+    return f"""
+    def Shader "{name}" {{
+        uniform token info:id = "ND_geompropvalue_{kind}"
+        string inputs:geomprop = "{name}"
+        {usd} inputs:default = {value}
+        {usd} outputs:out
+    }}
+"""
+
+
+def test_arithmetic_on_primvars(tmp_path):
+    """What nodes make of primvars is what the surface has, of one value or of many, of one primvar or of several."""
+    nodes = (
+        reader("r", "float")
+        + reader("g", "float")
+        + """
+    def Shader "B" {
+        uniform token info:id = "ND_multiply_float"
+        float inputs:in1.connect = </A/g.outputs:out>
+        float inputs:in2 = 0.5
+        float outputs:out
+    }
+    def Shader "C" {
+        uniform token info:id = "ND_combine3_color3"
+        float inputs:in1.connect = </A/r.outputs:out>
+        float inputs:in2.connect = </A/g.outputs:out>
+        float inputs:in3.connect = </A/B.outputs:out>
+        color3f outputs:out
+    }
+"""
+    )
+    vertices = "float[] primvars:r = [0, 0.1, 0.2, 0.3, 0.4, 0.5] (interpolation = 'vertex')"
+    half = "float inputs:base = 0.5\n color3f inputs:base_color.connect = </A/C.outputs:out>"
+    scene = load(tmp_path, painted(nodes, f"{vertices}\n float primvars:g = 0.75", half))
+    one, two = scene.meshes
+    expected = np.stack(np.broadcast_arrays(0.1 * one.triangles, 0.75, 0.375), axis=-1) * 0.5
+    np.testing.assert_allclose(one.colors, expected, atol=1e-6)
+    assert scene.materials[two.material[0]].albedo == pytest.approx((0.125, 0.125, 0.0625))
+    scene = load(tmp_path, painted(nodes, "float primvars:r = 1\n float primvars:g = 0.75", half))
+    assert scene.meshes[0].colors is None
+    assert scene.materials[scene.meshes[0].material[0]].albedo == pytest.approx((0.5, 0.375, 0.1875))
+    assert not warned(scene, "primvar")
+
+
+def test_primvars_under_a_coat_and_of_metals(tmp_path):
+    """A coat tints a primvar, and a strictly black metal keeps its part of it."""
+    inputs = """color3f inputs:base_color.connect = </A/C.outputs:out>
+        float inputs:base = 1
+        float inputs:coat = 1
+        color3f inputs:coat_color = (0.5, 1, 1)
+        float inputs:metalness = 0.75"""
+    text = painted(reader("C", "color3"), "color3f primvars:C = (0.5, 0.5, 0.25)", inputs)
+    scene = load(tmp_path, text, metals="black")
+    assert scene.materials[scene.meshes[0].material[0]].albedo == pytest.approx((0.0625, 0.125, 0.0625))
+    assert scene.materials[scene.meshes[1].material[0]].albedo == pytest.approx((0.03125, 0.0625, 0.0625))
+
+
+def test_an_image_times_a_primvar_is_named(tmp_path, image):
+    """The image counts as its mean on surfaces that have the primvar, and is seen on the others."""
+    nodes = (
+        reader("p", "color3", 1.0)
+        + """
+    def Shader "I" {
+        uniform token info:id = "ND_image_color3"
+        asset inputs:file = @a.png@
+        color3f outputs:out
+    }
+    def Shader "C" {
+        uniform token info:id = "ND_multiply_color3"
+        color3f inputs:in1.connect = </A/I.outputs:out>
+        color3f inputs:in2.connect = </A/p.outputs:out>
+        color3f outputs:out
+    }
+"""
+    )
+    base = "float inputs:base = 1\n color3f inputs:base_color.connect = </A/C.outputs:out>"
+    scene = load(tmp_path, painted(nodes, "color3f[] primvars:p = [(0.5, 0.25, 0)]", base))
+    one, two = (scene.materials[m.material[0]] for m in scene.meshes)
+    mean = srgb_to_linear(image[..., :3]).mean(axis=(0, 1))
+    assert one.albedo_texture is None and one.albedo == pytest.approx(mean * (0.5, 0.25, 0), rel=1e-3)
+    assert two.albedo_texture is not None and two.albedo == pytest.approx(mean, rel=1e-3)
+    assert warned(scene, "/A", "counts as its mean")
+
+
+@pytest.mark.parametrize(
+    "name, weight, scattered, sheen",
+    [
+        ("standard_surface", "subsurface", "subsurface_color", "sheen"),
+        ("open_pbr_surface", "subsurface_weight", "subsurface_color", "fuzz_weight"),
+    ],
+)
+def test_subsurface_and_sheen(tmp_path, name, weight, scattered, sheen):
+    """Scattering below the surface counts as diffuse reflection of its colour; sheen is named; metals have neither."""
+    base = "base" if name == "standard_surface" else "base_weight"
+    metal = "metalness" if name == "standard_surface" else "base_metalness"
+    inputs = f"""float inputs:{base} = 1
+        color3f inputs:base_color = (0.5, 0.5, 0.5)
+        float inputs:{weight} = 0.25
+        color3f inputs:{scattered} = (0.9, 0.1, 0.5)
+        float inputs:{sheen} = 1
+        """
+    text = material_text(inputs, shader=f"ND_{name}_surfaceshader", output="mtlx:surface") + mesh("")
+    scene = load(tmp_path, text)
+    assert only_material(scene).albedo == pytest.approx((0.6, 0.4, 0.5))
+    assert warned(scene, "/A", "subsurface", "diffuse") and warned(scene, "/A", "sheen is not rendered")
+    scene = load(tmp_path, text.replace(f"float inputs:{sheen}", f"float inputs:{metal}"))
+    assert only_material(scene).albedo == pytest.approx((0.5, 0.5, 0.5)) and not warned(scene, "sheen")
 
 
 MATERIALX = """
@@ -358,16 +563,17 @@ def test_real_files(file, images):
 
 def test_what_is_read_in_vain_is_named(tmp_path, image):
     """Normal maps, and primvars where only constants and images count, are said once; unset interfaces are not."""
-    assert warned(load(tmp_path, textured(target="normal3f inputs:normal") + mesh()), "/A", "normal", "not rendered")
+    target = "float inputs:displacement"
+    assert warned(load(tmp_path, textured(output="r", target=target) + mesh()), "/A", "displacement", "not rendered")
     opacity = textured(target="float inputs:opacity", output="result").replace("UsdUVTexture", "UsdPrimvarReader_float")
     opacity = opacity.replace(
         "asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1'
     )
     assert warned(load(tmp_path, opacity + mesh()), "/A", "opacity", "'veil'")
-    plain = material_text("normal3f inputs:normal.connect = </A.inputs:unset>").replace(
-        "token outputs:surface.connect", "normal3f inputs:unset\n token outputs:surface.connect"
+    plain = material_text("float inputs:displacement.connect = </A.inputs:unset>").replace(
+        "token outputs:surface.connect", "float inputs:unset\n token outputs:surface.connect"
     )
-    assert not warned(load(tmp_path, plain + mesh("")), "normal")
+    assert not warned(load(tmp_path, plain + mesh("")), "displacement")
 
 
 @pytest.mark.parametrize(

@@ -208,6 +208,8 @@ def test_a_material_that_cannot_be_read_leaves_the_display_colour(tmp_path, text
 
 def test_colour_spaces_are_converted(tmp_path):
     """A colour in sRGB encoding is decoded; one in linear Rec.709 is taken as it is."""
+    text = 'color3f inputs:diffuseColor = (0.5, 1, 0) (colorSpace = "lin_rec709")'
+    assert only_material(load(tmp_path, material_text(text) + BOUND)).albedo == (0.5, 1.0, 0.0)
     text = 'color3f inputs:diffuseColor = (0.5, 1, 0) (colorSpace = "srgb_rec709_scene")'
     decoded = ((0.5 + 0.055) / 1.055) ** 2.4
     assert only_material(load(tmp_path, material_text(text) + BOUND)).albedo == pytest.approx((decoded, 1, 0), abs=1e-3)

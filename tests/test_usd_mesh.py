@@ -291,11 +291,26 @@ def test_velocities_that_do_not_fit_are_named(tmp_path, velocities, word):
     assert warned(scene, "/M", "velocities", word) and scene.meshes[0].points[:, 2] == pytest.approx(4.5)
 
 
-def test_opacity_without_a_material_is_named(tmp_path):
-    """DisplayOpacity below 1 is drawn opaque, and says so; 1 is no trouble."""
-    for opacity, told in (("[0.5]", True), ("[1, 1]", False), ("[]", False)):
-        text = f"float[] primvars:displayOpacity = {opacity}"
-        assert warned(load(tmp_path, mesh_text(SQUARE, [4], range(4), text)), "/M", "displayOpacity") == told
+@pytest.mark.parametrize("color", ["", "color3f[] primvars:displayColor = [(1, 0, 0)]"])
+@pytest.mark.parametrize(
+    "opacity, expected, word",
+    [
+        ("[0.5]", 0.5, "partial opacity"),
+        ("[1, 1]", 1.0, None),
+        ("[]", 1.0, None),
+        ("[0.25, 0.5, 0.75, 0.5] (interpolation = 'vertex')", 0.5, "its mean is used"),
+        ("[0]", None, None),
+    ],
+)
+def test_opacity_without_a_material(tmp_path, color, opacity, expected, word):
+    """DisplayOpacity is the surface's where no material is bound; at 0 there is none."""
+    text = f"float[] primvars:displayOpacity = {opacity}\n{color}"
+    scene = load(tmp_path, mesh_text(SQUARE, [4], range(4), text))
+    if expected is None:
+        assert not scene.meshes and scene.stats["triangles_absent"] == 2
+    else:
+        assert [m.opacity for m in scene.materials] == [pytest.approx(expected)]
+    assert warned(scene, "/M", word or "pacity") == (word is not None)
 
 
 PI = np.pi

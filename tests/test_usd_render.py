@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.test_usd_material import QUADS, diffuse, load, only_material
 from warp_ir import InputError, RenderSettings, load_usd
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse
@@ -391,10 +392,49 @@ def test_wrong_types_and_values_are_survived(tmp_path):
     assert loaded > 60
 
 
-@pytest.mark.parametrize(("looks", "said"), [('"full", ""', 0), ('"full", "allPurpose"', 0), ('"preview"', 1)])
-def test_which_materials_settings_ask_for(tmp_path, looks, said):
-    """Only what differs from the schema's own choice, which many files write with a word for "", is named."""
-    text = f'def RenderSettings "S" {{\n    uniform token[] materialBindingPurposes = [{looks}]\n}}\n'
-    (tmp_path / "a.usda").write_text(f"#usda 1.0\n{ROOM}\n{text}")
-    warnings = load_usd(tmp_path / "a.usda", camera="A").warnings
-    assert sum("materialBindingPurposes" in line for line in warnings) == said
+@pytest.mark.parametrize(
+    "purposes, bound, expected",
+    [
+        ('"full", ""', "full preview all", "full"),
+        ('"full", "allPurpose"', "preview all", "all"),
+        ('"preview"', "full preview all", "preview"),
+        ('"preview"', "full all", "all"),
+        ('"preview", "full", ""', "full all", "full"),
+        ('"", "full"', "full all", "all"),
+        ('"", "full"', "full preview", "full"),
+        ('"proxy", "full"', "full proxy all", "proxy"),
+        ('"full"', "preview", "preview"),
+        ('"full", ""', "proxyOf preview", "preview"),
+        ('"a b", "preview"', "preview all", "preview"),
+    ],
+)
+def test_which_materials_settings_ask_for(tmp_path, purposes, bound, expected):
+    """The first purpose for which something is bound; then what is bound for all; another one with a warning."""
+    colors = {"full": 0.1, "preview": 0.2, "all": 0.3, "proxy": 0.4, "proxyOf": 0.5}
+    text = f'def RenderSettings "S" {{\n    uniform token[] materialBindingPurposes = [{purposes}]\n}}\n'
+    bindings = []
+    for name in bound.split():
+        text += diffuse(f"({colors[name]}, 0, 0)", name)
+        bindings.append(f"rel material:binding{'' if name == 'all' else ':' + name} = </{name}>\n")
+    mesh = f'def Mesh "M" (prepend apiSchemas = ["MaterialBindingAPI"]) {{{QUADS}{"".join(bindings)}}}\n'
+    scene = load(tmp_path, text + mesh)
+    assert only_material(scene).albedo[0] == pytest.approx(colors[expected])
+    wanted = purposes.replace("allPurpose", "").replace('"', "").split(", ")
+    asked = expected == "all" or expected in wanted
+    assert warned(scene, "/M", "only a material for the purpose", expected) != asked
+    assert warned(scene, "/S", "cannot be purposes") == ("a b" in purposes)
+
+
+@pytest.mark.parametrize(
+    "name, expected",
+    [("", None), ("lin_rec709", None), ("acescg", "lin_ap1_scene"), ("LinearRec2020", "lin_rec2020_scene")],
+)
+def test_the_rendering_color_space(tmp_path, name, expected):
+    """A linear space is that of linear pictures; what cannot be one is named."""
+    text = f'def RenderSettings "S" {{\n    uniform token renderingColorSpace = "{name}"\n}}\n'
+    scene = load(tmp_path, text)
+    assert scene.settings.get("color_space") == expected
+    assert warned(scene, "/S", "renderingColorSpace") == (expected is not None)
+    for bad in ("crayon", "g22_rec709_scene"):
+        scene = load(tmp_path, text.replace(f'"{name}"\n', f'"{bad}"\n', 1))
+        assert "color_space" not in scene.settings and warned(scene, "/S", "renderingColorSpace", bad)

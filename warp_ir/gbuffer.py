@@ -13,7 +13,7 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.lights import lights_found, surface_seen
-from warp_ir.surface import albedo, closest, shading_normal, smooth_rise
+from warp_ir.surface import albedo, closest, mapped_normal, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -129,6 +129,7 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
+        sight.shading_normal = mapped_normal(scene, hit, sight.shading_normal, pixel)
         sight.albedo = albedo(scene, hit, pixel)
         sight.emission = surface_seen(scene, hit, towards, pixel)
         reach = hit.t

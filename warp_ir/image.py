@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from warp_ir.color_space import COLOR_SPACES, REC709, from_rec709
 from warp_ir.scene import InputError
 from warp_ir.tonemap import srgb_from_linear, tone_map
 
@@ -36,6 +37,8 @@ SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg")
 _HALF_MAX = 65504.0
 _EXACT = frozenset({"position", "depth", "prim_id"})
 """AOVs that keep 32 bits in a half-float file: 11 bits are no distance and no name."""
+_COLORS = frozenset({None, "direct", "indirect", "albedo"})
+"""AOVs that are colours; None is the picture itself."""
 
 
 _Layers = dict[str, tuple[Array, bool]]
@@ -66,6 +69,7 @@ def write_image(
     aovs: Sequence[str] = (),
     half: bool = True,
     metadata: Mapping[str, object] | None = None,
+    color_space: str | None = None,
 ) -> list[Path]:
     """Writes a picture; the extension says how.
 
@@ -81,25 +85,32 @@ def write_image(
             other picture.png there will be a picture.NAME.png of each.
         half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped.
         metadata: More attributes for an EXR file, beside the film's settings and statistics.
+        color_space: One of `COLOR_SPACES`, in which colours are written where they stay linear; None: that of the
+            film's settings, else linear Rec. 709, which arrays and films are in.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: The path cannot be written, or the extension, AOV or tone curve is unknown.
+        InputError: The path cannot be written, or the extension, AOV, tone curve or colour space is unknown.
     """
     path = check_output(path)
+    if color_space is None:
+        color_space = getattr(getattr(source, "settings", None), "color_space", REC709)
+    if color_space not in COLOR_SPACES:
+        raise InputError(f"{path}: no colour space {color_space!r}; known are {', '.join(COLOR_SPACES)}")
     suffix = path.suffix.lower()
     if isinstance(source, np.ndarray) and (aov or aovs):
         raise InputError(f"{path}: an array has no AOVs; write a film")
     if suffix == ".exr":
-        layers = _exr_layers(source, aov, aovs)
-        _write_exr(path, layers, half, _attributes(source, metadata or {}), _windows(source))
+        layers = _exr_layers(source, aov, aovs, color_space)
+        attributes = {**_attributes(source, metadata or {}), "colorInteropID": color_space}
+        _write_exr(path, layers, half, attributes, COLOR_SPACES[color_space], _windows(source))
         return [path]
-    _write_flat(path, source, exposure, tonemap, aov)
+    _write_flat(path, source, exposure, tonemap, aov, color_space)
     beside = [aov_path(path, name) for name in aovs]
     for name, other in zip(aovs, beside, strict=True):
-        _write_flat(other, source, exposure, tonemap, name)
+        _write_flat(other, source, exposure, tonemap, name, color_space)
     return [path, *beside]
 
 
@@ -233,8 +244,14 @@ def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | No
     return values, None if alpha is None else np.asarray(alpha, dtype=np.float32)[..., None]
 
 
-def _exr_layers(source: "_Film | Array", aov: str | None, aovs: Sequence[str]) -> _Layers:
+def _linear(values: Array, aov: str | None, color_space: str) -> Array:
+    """Values as they are stored where they stay linear: colours in a colour space, others as they are."""
+    return from_rec709(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
+
+
+def _exr_layers(source: "_Film | Array", aov: str | None, aovs: Sequence[str], color_space: str) -> _Layers:
     values, alpha = _pixels(source, aov)
+    values = _linear(values, aov, color_space)
     names: Sequence[str] = ("R", "G", "B")
     if values.shape[2] == 1:
         names = AOV_CHANNELS[aov] if aov else ("Y",)
@@ -242,7 +259,7 @@ def _exr_layers(source: "_Film | Array", aov: str | None, aovs: Sequence[str]) -
     if alpha is not None:
         layers["A"] = (alpha[..., 0], False)
     for name in aovs:
-        values, _ = _pixels(source, name)
+        values = _linear(_pixels(source, name)[0], name, color_space)
         layers |= {channel: (values[..., k], name in _EXACT) for k, channel in enumerate(AOV_CHANNELS[name])}
     return layers
 
@@ -257,7 +274,12 @@ def _windows(source: "_Film | Array") -> tuple[int, int, int, int] | None:
 
 
 def _write_exr(
-    path: Path, layers: _Layers, half: bool, attributes: dict[str, Any], windows: tuple[int, int, int, int] | None
+    path: Path,
+    layers: _Layers,
+    half: bool,
+    attributes: dict[str, Any],
+    chromaticities: Sequence[float],
+    windows: tuple[int, int, int, int] | None,
 ) -> None:
     import OpenImageIO as oiio
 
@@ -274,13 +296,18 @@ def _write_exr(
         spec.x, spec.y, spec.full_width, spec.full_height = windows
     for name, value in attributes.items():
         spec.attribute(name, value)
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(chromaticities))
     _save(path, spec, pixels)
 
 
-def _write_flat(path: Path, source: "_Film | Array", exposure: float, tonemap: str, aov: str | None) -> None:
+def _write_flat(
+    path: Path, source: "_Film | Array", exposure: float, tonemap: str, aov: str | None, color_space: str
+) -> None:
     """A file without layers: the linear formats, and those for a screen."""
     values, alpha = _pixels(source, aov)
     suffix = path.suffix.lower()
+    if suffix in (".npy", ".hdr", ".pfm"):
+        values = _linear(values, aov, color_space)
     if suffix == ".npy":
         with whole_file(path) as temporary:
             np.save(temporary, values, allow_pickle=False)

@@ -112,6 +112,9 @@ class Material:
     """Radiance that the camera sees of the emitting side, where that is not `emission`, by which it lights the scene;
     None: the same, shaped as the mesh's `MeshLight` has it."""
     glow_texture: Texture | None = None
+    normal_texture: Texture | None = None
+    """Normals [x, y, z], of any length, by which the camera sees the surface lit: x where the first of the mesh's
+    texture coordinates grows, y where the second does, z out of the front. Without such coordinates it does nothing."""
 
     def __post_init__(self) -> None:
         if self.albedo_texture is not None:
@@ -126,8 +129,14 @@ class Material:
     @property
     def textures(self) -> tuple[Texture, ...]:
         """Those it has."""
-        found = (self.albedo_texture, self.emission_texture, self.opacity_texture, self.glow_texture)
-        return tuple(texture for texture in found if texture is not None)
+        images = (
+            self.albedo_texture,
+            self.emission_texture,
+            self.opacity_texture,
+            self.glow_texture,
+            self.normal_texture,
+        )
+        return tuple(image for image in images if image is not None)
 
 
 @dataclass(frozen=True, eq=False)

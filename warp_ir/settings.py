@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from warp_ir.color_space import COLOR_SPACES, REC709
 from warp_ir.scene import CONFORM_POLICIES, InputError
 
 ESTIMATOR_NAMES = ("vpl", "keller", "path")
@@ -63,6 +64,12 @@ class RenderSettings:
     filter: bool = _setting(True, "vpl only: filter the noise that is left; off, the picture is the unbiased mean")
     denoise: bool = _setting(False, "average the filtered picture with one by Open Image Denoise (extra 'denoise')")
     visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
+    color_space: str = _setting(
+        REC709,
+        "colour space of linear pictures (.exr, .hdr, .pfm, .npy); lin_ap1_scene is ACEScg. Light is computed in"
+        " linear Rec. 709, and what is tone-mapped is sRGB in any case",
+        tuple(COLOR_SPACES),
+    )
     seed: int = _setting(0, "seed of the random scrambling; the same seed gives the same bits")
 
     def __post_init__(self) -> None:
@@ -78,6 +85,7 @@ class RenderSettings:
         self._check("bound_radius", self.bound_radius == 0 or _positive(self.bound_radius), "a number of at least 0")
         self._check("pixel_aspect", _positive(self.pixel_aspect), "a positive number")
         self._check("conform", self.conform in CONFORM_POLICIES, f"one of {', '.join(CONFORM_POLICIES)}")
+        self._check("color_space", self.color_space in COLOR_SPACES, f"one of {', '.join(COLOR_SPACES)}")
         self._check_data_window()
         self._check("estimator", self.estimator in ESTIMATOR_NAMES, f"one of {', '.join(ESTIMATOR_NAMES)}")
         self._check("absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}")

@@ -260,6 +260,54 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
     return wp.where(wp.dot(n, hit.normal) < 0.0, -n, n) / length
 
 
+@wp.func(inline=False)
+def _mapped(address: wp.uint64, hit: Hit, normal: wp.vec3, footprint: float) -> wp.vec3:
+    """The normal that a material's texture makes of a unit `normal` on the side that was hit."""
+    scene = scene_at(address)[0]
+    p = scene.patterns[0]
+    texture = p.normal_texture[scene.triangle_material[hit.triangle]]
+    uvs = p.triangle_uvs[hit.triangle]
+    if texture < 0 or uvs < 0:
+        return normal
+    row = p.textures.rows[texture]
+    first = uvs + 3 * row.uv_set
+    ab_uv = p.corner_uvs[first + 1] - p.corner_uvs[first]
+    ac_uv = p.corner_uvs[first + 2] - p.corner_uvs[first]
+    ab = scene.points[scene.indices[3 * hit.triangle + 1]] - scene.points[scene.indices[3 * hit.triangle]]
+    ac = scene.points[scene.indices[3 * hit.triangle + 2]] - scene.points[scene.indices[3 * hit.triangle]]
+    if hit.instance >= 0:
+        ab = scene.instance_axes[hit.instance] * ab
+        ac = scene.instance_axes[hit.instance] * ac
+    # The directions in which u and v grow, but for lengths.
+    turn = wp.sign(ab_uv[0] * ac_uv[1] - ab_uv[1] * ac_uv[0])
+    along_u = turn * (ab * ac_uv[1] - ac * ab_uv[1])
+    along_v = turn * (ac * ab_uv[0] - ab * ac_uv[0])
+    out = wp.where(hit.front == 1, normal, -normal)
+    x = wp.normalize(along_u - out * wp.dot(out, along_u))
+    y = wp.cross(out, x)
+    y = wp.where(wp.dot(y, along_v) < 0.0, -y, y)
+    uv = _uv_at(p, hit.triangle, row.uv_set, hit.u, hit.v)
+    level = mip_level(p.textures, row, uv[2] / hit.area, footprint)
+    n = lookup(p.textures, row, coordinates(row, wp.vec2(uv[0], uv[1])), level)
+    mapped = n[0] * x + n[1] * y + n[2] * out
+    length = wp.length(mapped)
+    if uv[2] == 0.0 or wp.length_sq(x) == 0.0 or not (length > 1.0e-6):
+        return normal
+    return wp.where(hit.front == 1, mapped, -mapped) / length
+
+
+@wp.func
+def mapped_normal(scene: SceneData, hit: Hit, normal: wp.vec3, footprint: float) -> wp.vec3:
+    """A shading normal as the material's normal map tilts it, as the mean over a patch as wide as `footprint`.
+
+    The surface seen from behind is the same, so its normals are the opposite of those in front. The tangent plane is
+    that of `normal`, its first axis where u grows; what a mirrored image mirrors is the second.
+    """
+    if scene.normal_map_count > 0:
+        return _mapped(scene.address, hit, normal, footprint)
+    return normal
+
+
 @wp.func
 def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
     """From a hit to the smooth surface that its triangle's normals stand for; zero where that is not above it.

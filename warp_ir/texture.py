@@ -156,7 +156,8 @@ def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launche
     for k, (texture, pixels) in enumerate(zip(textures, _within_budget(textures), strict=True)):
         chain = mip_chain(pixels)
         # Halves hold 11 bits between 6e-5 and 65504: scaled to 1, whatever the unit.
-        scale = 2.0 ** math.frexp(float(pixels.max()))[1] if pixels.max() > 0.0 else 1.0
+        largest = max(float(pixels.max()), -float(pixels.min()))
+        scale = 2.0 ** math.frexp(largest)[1] if largest > 0.0 else 1.0
         rows[k]["first_level"], rows[k]["level_count"], rows[k]["channels"] = len(levels), len(chain), pixels.shape[2]
         rows[k]["wrap_s"], rows[k]["wrap_t"] = texture.wrap
         rows[k]["scale"] = scale

@@ -20,7 +20,7 @@ from warp_ir.tonemap import TONEMAPS
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
 _ONLY_PICTURES = {
     *("iterations", "time_limit", "target_error", "visible_lights", "bound_radius"),
-    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur"),
+    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space"),
 }
 """Settings that the light paths alone do not depend on."""
 _SHORT = {"width": ("-w",)}

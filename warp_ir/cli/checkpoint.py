@@ -19,8 +19,8 @@ from warp_ir.settings import RenderSettings
 
 _SHARE = 0.05
 """Most of the time that writing checkpoints may take."""
-_LIMITS = ("iterations", "time_limit", "target_error")
-"""Settings that say when to stop: a render may go on under others."""
+_FREE = ("iterations", "time_limit", "target_error", "color_space")
+"""Settings that no sample depends on: a render may go on under others."""
 _TALK = ("warnings", "stats", "name", "settings")
 """What of a scene no pixel depends on."""
 
@@ -88,9 +88,9 @@ def path_of(output: Path) -> Path:
 
 
 def fingerprint(scene: Scene, settings: RenderSettings) -> str:
-    """Of everything that the pixels depend on, the limits apart."""
+    """Of everything that the samples depend on."""
     digest = hashlib.blake2b(digest_size=16)
-    how = {name: value for name, value in settings.to_dict().items() if name not in _LIMITS}
+    how = {name: value for name, value in settings.to_dict().items() if name not in _FREE}
     digest.update(f"{__version__} {how}".encode())
     _add(digest, scene, {})
     return digest.hexdigest()

@@ -59,6 +59,7 @@ def stage_facts(reader: Any) -> dict[str, Any]:
                 "used": spec.path,
                 "all": [str(prim.GetPath()) for prim in render_settings_prims(stage)],
                 "purposes": None if spec.purposes is None else list(spec.purposes),
+                "material_purposes": list(spec.material_purposes),
                 "products": [
                     {
                         "path": product.path,

@@ -13,6 +13,8 @@ MAX_TRIANGLES = 200_000_000
 """Above this a scene is refused before anything is allocated."""
 _BYTES_PER_TRIANGLE = 200
 _BYTES_PER_INSTANCE = 400
+_LARGEST_NORMAL = 1.0e6
+"""Of a normal map: its square has to be finite."""
 
 
 def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
@@ -75,9 +77,11 @@ def _check_material(material: Material) -> None:
         pixels = texture.pixels
         shaped = pixels.ndim == 3 and min(pixels.shape) >= 1 and pixels.shape[2] in (1, 3)
         demand(shaped, f"texture {texture.name}: pixels must have shape [h, w, 3] or [h, w, 1]")
-        demand(
-            np.isfinite(pixels).all() and pixels.min() >= 0.0, f"texture {texture.name}: pixels must be finite, >= 0"
-        )
+        demand(np.isfinite(pixels).all(), f"texture {texture.name}: pixels must be finite")
+        signed = texture is material.normal_texture
+        demand(signed or pixels.min() >= 0.0, f"texture {texture.name}: pixels must not be negative")
+        usable = not signed or (pixels.shape[2] == 3 and float(np.abs(pixels).max()) <= _LARGEST_NORMAL)
+        demand(usable, f"texture {texture.name}: normals have three channels, each at most {_LARGEST_NORMAL:g}")
         placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
         demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
         demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")

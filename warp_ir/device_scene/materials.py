@@ -36,10 +36,12 @@ def upload_materials(
     data.opacity_texture = launcher.array([row[m.opacity_texture] for m in materials], wp.int32)
     data.open_count = sum(m.opacity < 1.0 for m in materials)
     data.texture_count = len(textures)
+    data.normal_map_count = sum(m.normal_texture is not None for m in materials)
     patterns = Patterns()
     patterns.textures = texture_table(textures)
     unseen = (-1.0, -1.0, -1.0)
     patterns.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
     patterns.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
     data.glow_count = sum(m.glow is not None for m in materials)
+    patterns.normal_texture = launcher.array([row[m.normal_texture] for m in materials], wp.int32)
     return patterns

@@ -25,6 +25,7 @@ class Patterns:
     corner_uvs: wp.array[wp.vec2]
     glow: wp.array[wp.vec3]  # [materials], what the camera sees in place of the emission; negative: nothing else
     glow_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
+    normal_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
 
 
 @wp.struct
@@ -65,6 +66,7 @@ class SceneData:
     emission_texture: wp.array[wp.int32]
     opacity_texture: wp.array[wp.int32]
     texture_count: int
+    normal_map_count: int  # materials with one
     patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
     open_count: int  # materials whose opacity is below 1 anywhere
     glow_count: int  # materials of which the camera sees something else than their emission

@@ -9,12 +9,13 @@ from pxr import Sdf, Usd, UsdLux
 from warp_ir.placing import areas_of_copies
 from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
 from warp_ir.usd import value
+from warp_ir.usd.binding import PURPOSES
 from warp_ir.usd.glow import LAMP_UV, Lamp
+from warp_ir.usd.images import Images
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.instancing import combined, combined_colors
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
-from warp_ir.usd.network import Images
 from warp_ir.usd.primvar import texture_coordinates
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
@@ -63,6 +64,7 @@ def build_meshes(
     shapes: _Shapes | None = None,
     images: Images | None = None,
     metals: str = "diffuse",
+    purposes: Sequence[str] = PURPOSES[:2],
 ) -> Geometry:
     """All meshes, one per gprim with all its copies, those that are instanced, and the materials they use.
 
@@ -74,11 +76,12 @@ def build_meshes(
         shapes: Those that are known already; new ones are added.
         images: Those that are known already, likewise.
         metals: "diffuse" or "black".
+        purposes: Of the bindings of materials, in the order in which they are wanted.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
-    table = MaterialTable(time, report, images, metals)
+    table = MaterialTable(time, report, images, metals, purposes)
     return _Builder(time, report, levels, table, {} if shapes is None else shapes).run(sites)
 
 

@@ -15,6 +15,7 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd import value
+from warp_ir.usd.color import between, color_space
 from warp_ir.usd.dome import LAYOUTS, to_latlong
 from warp_ir.usd.inputs import Inputs
 from warp_ir.usd.report import Report, Unreadable
@@ -185,13 +186,16 @@ def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     layout = inputs.text("texture:format", "automatic") if kind == LightKind.DOME else "latlong"
     if layout not in ("automatic", "latlong", *LAYOUTS):
         inputs.warn(f"texture:format: '{layout}' is no layout; read as latlong")
-    space = inputs.attribute("texture:file").GetColorSpace()
+    space = str(inputs.attribute("texture:file").GetColorSpace() or "auto")
     try:
-        image = read_texture(asset, space if space in ("raw", "sRGB") else "auto", _TEXELS[kind])
+        primaries = color_space(space)
+        image = read_texture(asset, space, _TEXELS[kind])
         pixels = to_latlong(image.rgb, layout) if layout in LAYOUTS else image.rgb
     except Unreadable as trouble:
         inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
         return None
+    if primaries is not None:
+        pixels = pixels @ between(primaries, None).T.astype(np.float32)
     return np.clip(pixels, 0.0, _BRIGHTEST_TEXEL)
 
 

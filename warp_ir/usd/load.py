@@ -14,10 +14,10 @@ from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.black import explain_blackness, explain_dark_lights
 from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.gprim import Geometry, build_meshes
+from warp_ir.usd.images import Images
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.linking import link
 from warp_ir.usd.motion import Motion
-from warp_ir.usd.network import Images
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
@@ -233,7 +233,8 @@ class StageReader:
     def _scene(self, time: Usd.TimeCode, camera: Usd.Prim | None, spec: RenderSpec, report: Report) -> Scene:
         """Everything at one moment."""
         view = None if camera is None else read_camera(camera, time, report)
-        key = (*(self._purposes or spec.purposes or _DRAWN), time.IsDefault())
+        key = (*(self._purposes or spec.purposes or _DRAWN), time.IsDefault(), spec.material_purposes)
+        self._motion.purposes = spec.material_purposes
         still = self._still
         if still is None or self._motion.rearranges or key != still.key:
             still = self._still = self._walk(time, key)
@@ -279,7 +280,7 @@ class StageReader:
     def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
         """What is drawn, and where; what stays the same at all times is read the first time."""
         report = self._opened.part()
-        found = walk(self.stage, time, key[:-1], report)
+        found = walk(self.stage, time, key[:-2], report)
         moving, staying = Found(), Found()
         for name in ("shapes", "lights"):
             for site in getattr(found, name):
@@ -287,7 +288,9 @@ class StageReader:
                 getattr(moving if moves else staying, name).append(site)
         if self._still is None or key != self._still.key:
             read = self._opened.part()
-            geometry = build_meshes(staying.shapes, time, read, self._levels, images=self._images, metals=self._metals)
+            geometry = build_meshes(
+                staying.shapes, time, read, self._levels, images=self._images, metals=self._metals, purposes=key[-1]
+            )
             lights = _lights(staying.lights, time, read)
             self._shapes.clear()
         else:
@@ -303,7 +306,12 @@ class StageReader:
         whole = still
         for some, shapes in ((rigid, self._shapes), (bending, {})):
             if some:
-                whole = _join(whole, build_meshes(some, time, report, self._levels, shapes, self._images, self._metals))
+                whole = _join(
+                    whole,
+                    build_meshes(
+                        some, time, report, self._levels, shapes, self._images, self._metals, self._motion.purposes
+                    ),
+                )
         return whole
 
 
@@ -312,7 +320,7 @@ class _Still:
     """What a stage keeps from one moment to the next."""
 
     key: tuple[Any, ...]
-    """The purposes that are drawn, and whether it was at the default time."""
+    """The purposes that are drawn, whether it was at the default time, and the purposes of materials."""
     moving: Found
     """What has to be read each time."""
     geometry: Geometry

@@ -8,9 +8,11 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from warp_ir.scene import Floats, Ints, Material
 from warp_ir.usd import primvar, value
-from warp_ir.usd.network import Images
+from warp_ir.usd.binding import PURPOSES, bound_materials, order_of
+from warp_ir.usd.images import Images
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape
+from warp_ir.usd.signal import Signal
 from warp_ir.usd.surface import read_material
 
 ABSENT = -1
@@ -47,16 +49,23 @@ class MaterialTable:
         report: Where troubles go.
         images: Those that are known already; None: none are.
         metals: "diffuse" or "black".
+        purposes: Of bindings, in the order in which they are wanted.
     """
 
     def __init__(
-        self, time: Usd.TimeCode, report: Report, images: Images | None = None, metals: str = "diffuse"
+        self,
+        time: Usd.TimeCode,
+        report: Report,
+        images: Images | None = None,
+        metals: str = "diffuse",
+        purposes: Sequence[str] = PURPOSES[:2],
     ) -> None:
         self.materials: list[Material] = []
+        self._purposes = purposes
         self._time, self._report = time, report
         self._images, self._black_metals = images or Images(report), metals == "black"
         self._images.report = report
-        self._primvars: dict[int, str] = {}
+        self._asked: dict[int, Signal] = {}
         self._known: dict[Material, int] = {}
         self._read: dict[Sdf.Path, int] = {}
         self._bound: dict[Sdf.Path, int] = {}
@@ -71,15 +80,13 @@ class MaterialTable:
     def resolve(self, prims: Sequence[Usd.Prim]) -> None:
         """Find the materials bound to prims and to their subsets; at once, for USD shares the work."""
         prims = [p for prim in prims for p in (prim, *material_subsets(prim))]
-        found, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(prims, UsdShade.Tokens.full)
-        unbound = [prim for prim, material in zip(prims, found, strict=True) if not material]
-        second, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(unbound, UsdShade.Tokens.preview)
-        for prim, material in zip(prims, found, strict=True):
-            if material:
-                self._bound[prim.GetPath()] = self._index_of(material)
-        for prim, material in zip(unbound, second, strict=True):
-            if material:
-                self._report.warn(prim.GetPath(), "only a material for the purpose 'preview' is bound; it is used")
+        for prim, found in zip(prims, bound_materials(prims, order_of(self._purposes)), strict=True):
+            if found is not None:
+                material, purpose = found
+                if purpose and purpose not in self._purposes:
+                    self._report.warn(
+                        prim.GetPath(), f"only a material for the purpose '{purpose}' is bound; it is used"
+                    )
                 self._bound[prim.GetPath()] = self._index_of(material)
             elif (target := _dangling_target(prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the material it is bound to, {target}, does not exist")
@@ -94,19 +101,24 @@ class MaterialTable:
     def _colored(self, prim: Usd.Prim, shape: Shape, index: Ints) -> Look:
         """The look of triangles with a material each: displayColor where there is none, primvars where it asks."""
         bare = index == UNBOUND
-        asked = {int(k): self._primvars[k] for k in np.unique(index) if k in self._primvars}
+        asked = {int(k): self._asked[k] for k in np.unique(index) if k in self._asked}
         if not bare.any() and not asked:
             return Look(index)
         colors: Floats | None = None
-        for k, name in asked.items():
-            color = primvar.display_color(prim, shape, self._time, self._report, name)
+        for k, albedo in asked.items():
+            color = self._from_primvars(prim, shape, albedo)
             if color is None:
                 continue
             chosen = index == k
+            material = self.materials[k]
+            if material.albedo_texture is not None:
+                self._report.warn(material.name, "its image counts as its mean where primvars are read")
+                material = replace(material, albedo_texture=None)
             if color.ndim == 1:
                 red, green, blue = color.tolist()
-                index[chosen] = self.add(replace(self.materials[k], albedo=(red, green, blue)))
-            else:
+                material = replace(material, albedo=(red, green, blue))
+            index[chosen] = self.add(material)
+            if color.ndim > 1:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
         if not bare.any():
@@ -120,17 +132,36 @@ class MaterialTable:
             look, colors=colors if look.colors is None else np.where(chosen[:, None, None], look.colors, colors)
         )
 
+    def _from_primvars(self, prim: Usd.Prim, shape: Shape, albedo: Signal) -> Floats | None:
+        """An albedo that depends on primvars, [3] or [m, 3, 3]; None if the prim has none of them."""
+        values = {}
+        for asked in albedo.primvars:
+            found = primvar.corner_values(prim, shape, asked.name, asked.channels, self._time, self._report)
+            if found is not None:
+                values[asked] = found
+        if not values:
+            return None
+        colors = albedo.at(values)
+        if colors.min() < 0.0 or colors.max() > 1.0:
+            names = ", ".join(asked.name for asked in values)
+            self._report.warn(prim.GetPath(), f"albedo of the primvar {names} outside [0, 1] clamped")
+        return colors.clip(0.0, 1.0)
+
     def _bare(self, prim: Usd.Prim, shape: Shape, index: Ints, bare: Mask) -> Look:
         """The look of a prim of whose triangles some have no material."""
         color = primvar.display_color(prim, shape, self._time, self._report)
+        opacity = primvar.display_opacity(prim, shape, self._time, self._report)
+        if opacity <= 0.0:
+            index[bare] = ABSENT
+            return Look(index)
         if color is None:
-            index[bare] = self.add(Material("no material"))
+            index[bare] = self.add(Material("no material", opacity=opacity))
             return Look(index, bare=bare)
         if color.ndim == 1:
             red, green, blue = color.tolist()
-            index[bare] = self.add(Material("displayColor", (red, green, blue)))
+            index[bare] = self.add(Material("displayColor", (red, green, blue), opacity=opacity))
             return Look(index)
-        index[bare] = self.add(Material("displayColor"))
+        index[bare] = self.add(Material("displayColor", opacity=opacity))
         colors = np.where(bare[:, None, None], color.astype(np.float32), self.albedo(index)[:, None])
         return Look(index, colors)
 
@@ -188,8 +219,8 @@ class MaterialTable:
             try:
                 read = read_material(material, self._time, self._images, black_metals=self._black_metals)
                 self._read[path] = ABSENT if read is None else self.add(read.material)
-                if read is not None and read.primvar:
-                    self._primvars[self._read[path]] = read.primvar
+                if read is not None and read.albedo is not None:
+                    self._asked[self._read[path]] = read.albedo
             except Unreadable as trouble:
                 self._report.warn(material.GetPath(), str(trouble))
                 self._read[path] = UNBOUND

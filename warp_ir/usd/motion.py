@@ -1,10 +1,11 @@
 """What of a stage may change with time: the rest is read once, however many moments are asked for."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
 from warp_ir.usd import value
+from warp_ir.usd.binding import PURPOSES, bound_materials, order_of
 
 _ALL = Usd.PrimIsActive & Usd.PrimIsLoaded
 """Prototypes may live below an `over` or a `class`."""
@@ -22,6 +23,8 @@ class Motion:
         self._known: dict[Sdf.Path, bool] = {}
         self._networks: dict[Sdf.Path, bool] = {}
         self._shading = False
+        self.purposes: Sequence[str] = PURPOSES[:2]
+        """Of the bindings of materials that count."""
         self.rearranges = False
         """Whether anything that can be drawn may move, appear or vanish."""
         instancers = []
@@ -75,11 +78,8 @@ class Motion:
         if not self._shading:
             return False
         prims = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
-        for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
-            bound, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(prims, purpose)
-            if any(self._network(material.GetPrim()) for material in bound if material):
-                return True
-        return False
+        found = bound_materials(prims, order_of(self.purposes))
+        return any(self._network(pair[0].GetPrim()) for pair in found if pair is not None)
 
     def _network(self, material: Usd.Prim) -> bool:
         if material.GetPath() not in self._networks:

@@ -1,185 +1,33 @@
-"""Networks of shading nodes as values: constants, images in place on a surface, or primvars.
-
-An image that is scaled, tinted or mixed with constants is again an image, so all of that is done once, here, and
-renders for nothing. Two images that lie in the same place are combined pixel by pixel; if they do not, the second
-counts as its mean.
-"""
+"""Networks of shading nodes, evaluated: what an input of a surface shader gets."""
 
 import math
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.mipmap import resized
 from warp_ir.scene import Floats, Texture, Wrap
 from warp_ir.usd import value
-from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.texture import MAX_PIXELS, Image, read_texture
+from warp_ir.usd.images import Images
+from warp_ir.usd.report import Unreadable
+from warp_ir.usd.signal import Place, Primvar, Signal, as_color, combine, constant, from_primvar, select
 
-MAX_TEXTURE_PIXELS = 2**27
-"""Of all images of a scene: each takes at most half of what is left."""
 _DEPTH = 32
 """Longest chain of nodes that is followed."""
 _NODE_BUDGET = 256
 """Most nodes that one input may need: shared nodes count every time they are used."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
+_READERS = {"UsdPrimvarReader": ("varname", "fallback"), "geompropvalue": ("geomprop", "default")}
+"""Nodes that read primvars: their inputs for its name, and for the value where there is none."""
+_CHANNELS = {
+    **dict.fromkeys(("float", "int", "integer"), 1),
+    **dict.fromkeys(("float2", "vector2"), 2),
+    **dict.fromkeys(("float3", "vector3", "color3", "normal", "point", "vector"), 3),
+    **dict.fromkeys(("float4", "vector4", "color4"), 4),
+}
+"""Of what they read."""
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
-_SRGB_NAMES = ("srgb_texture", "srgb", "srgb_rec709_scene", "sRGB")
-_LINEAR_NAMES = {"acescg": Gf.ColorSpaceNames.LinearAP1, "lin_srgb": Gf.ColorSpaceNames.LinearRec709}
-_UNSAID = ("", "auto", "raw", "data", "identity", "unknown", Gf.ColorSpaceNames.LinearRec709, "lin_rec709", "none")
-
-
-@dataclass(frozen=True)
-class Place:
-    """How an image lies on a surface."""
-
-    uv: str = "st"
-    transform: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """What comes out of a network."""
-
-    pixels: Floats
-    """float [h, w, c], [1, 1, c] for a constant; row 0 at the top."""
-    outside: Floats
-    """float [c], the value beyond the image's edges."""
-    place: Place | None
-    """None: it is a constant."""
-    key: Hashable
-    """Equal where the content is."""
-    name: str = ""
-    """Of the image."""
-    primvar: str = ""
-    """Read from the surface's primvar of this name; `pixels` is the value where it has none."""
-
-    @property
-    def mean(self) -> Floats:
-        """Over the pixels, float64 [c]."""
-        return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
-
-
-def constant(*channels: float) -> Signal:
-    """The same everywhere."""
-    at = np.array(channels, np.float64)
-    return Signal(at.reshape(1, 1, -1), at, None, tuple(channels))
-
-
-def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> Signal:
-    """A function of signals, pixel by pixel; it takes and gives arrays [..., c].
-
-    Args:
-        label: Tells functions apart.
-        function: Of as many arrays.
-        signals: Their arguments.
-    """
-    images = [s for s in signals if s.place is not None]
-    key = (label, *(s.key for s in signals))
-    if not images:
-        made = _finite(function(*(s.pixels for s in signals)))
-        return Signal(made, made[0, 0], None, key)
-    first = images[0]
-    together = [s for s in images if s.place == first.place]
-    height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
-    pixels, outside = [], []
-    for s in signals:
-        if s.place is not None and s.place != first.place:
-            pixels.append(s.mean.reshape(1, 1, -1))
-            outside.append(s.mean)
-        else:
-            fits = s.place is None or s.pixels.shape[:2] == (height, width)
-            pixels.append(s.pixels if fits else resized(s.pixels, height, width))
-            outside.append(s.outside)
-    made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
-    made = np.broadcast_to(made, (height, width, made.shape[-1]))
-    return Signal(_compact(made), _finite(function(*outside)), first.place, key, first.name)
-
-
-def _finite(values: Floats) -> Floats:
-    """Arithmetic in a file may overflow."""
-    return np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
-
-
-def select(signal: Signal, channels: list[int]) -> Signal:
-    """Some channels, in any order."""
-    pixels, outside = signal.pixels[..., channels], np.asarray(signal.outside)[channels]
-    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key))
-
-
-def as_color(signal: Signal) -> Signal:
-    """Three channels: the first three, or one thrice."""
-    count = signal.pixels.shape[2]
-    if count == 3:
-        return signal
-    return select(signal, [0, 1, 2] if count > 3 else [0, 0, 0])
-
-
-class Images:
-    """The images of a scene and the textures made of them, each once.
-
-    Args:
-        report: Where troubles and counts go.
-        default_wrap: The wrap mode where neither the network nor the file gives one.
-    """
-
-    def __init__(self, report: Report, default_wrap: str = "black") -> None:
-        self.report = report
-        self.default_wrap = default_wrap
-        self._images: dict[tuple[str, str], Image | str] = {}
-        self._textures: dict[Hashable, Texture] = {}
-        self._left = MAX_TEXTURE_PIXELS
-
-    def read(self, asset: Sdf.AssetPath, space: str, resolved: str = "") -> Image:
-        """An image, from the file the first time.
-
-        Raises:
-            Unreadable: There is none.
-        """
-        key = (resolved or asset.resolvedPath or asset.path, space)
-        if key not in self._images:
-            limit = max(min(MAX_PIXELS, self._left // 2), 1)
-            try:
-                image = read_texture(resolved or asset, space, limit)
-            except Unreadable as trouble:
-                self._images[key] = str(trouble)
-            else:
-                self._left -= image.pixels.shape[0] * image.pixels.shape[1]
-                self._images[key] = replace(image, pixels=_compact(image.pixels))
-                self.report.stats["images"] += 1
-                if image.pixels.shape[:2] != (image.height, image.width):
-                    self.report.warn(asset.path, "image averaged down to fit the memory for textures ({n} in all)")
-        found = self._images[key]
-        if isinstance(found, str):
-            raise Unreadable(found)
-        return found
-
-    def texture(self, signal: Signal) -> Texture:
-        """A signal as a texture; equal ones are the same."""
-        assert signal.place is not None
-        key = (signal.key, signal.place)
-        if key not in self._textures:
-            red, green, blue = np.broadcast_to(signal.outside, 3).tolist()
-            self._textures[key] = Texture(
-                signal.name,
-                signal.pixels,
-                signal.place.wrap,
-                (red, green, blue),
-                signal.place.uv,
-                np.array(signal.place.transform, np.float64),
-            )
-        return self._textures[key]
-
-
-def _compact(pixels: Floats) -> Floats:
-    """In halves where they are enough: 11 bits from 6e-5 to 65504."""
-    if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
-        return pixels
-    return pixels.astype(np.float16)
 
 
 class Network:
@@ -226,7 +74,7 @@ class Network:
                 what = "a finite colour" if array.shape == (3,) else "a finite number"
                 raise Unreadable(f"{attribute.GetName()} is {_short(channels)}, not {what}")
             array = np.atleast_1d(array).astype(np.float64)
-            if len(array) == 3:
+            if len(array) == 3 and value.is_color(attribute):
                 array = value.to_linear_rec709(attribute, array.reshape(1, 3))[0]
             return constant(*array.tolist())
         self._nodes += 1
@@ -237,12 +85,12 @@ class Network:
         name = identifier.removeprefix("ND_")
         if name in ("UsdUVTexture", "UsdUVTexture_23"):
             return self._uv_texture(node, output, default)
-        if name.startswith("UsdPrimvarReader_"):
-            fallback = self._input(node.GetInput("fallback"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
-            return replace(fallback, primvar=self._text(node.GetInput("varname")))
-        if name.startswith("geompropvalue_"):
-            fallback = self._input(node.GetInput("default"), constant(*[0.0] * default.pixels.shape[2]), depth - 1)
-            return replace(fallback, primvar=self._text(node.GetInput("geomprop")))
+        reader, _, kind = name.partition("_")
+        if reader in _READERS and kind in _CHANNELS:
+            named, otherwise = _READERS[reader]
+            primvar = Primvar(self._text(node.GetInput(named)), _CHANNELS[kind])
+            fallback = self._input(node.GetInput(otherwise), constant(*[0.0] * primvar.channels), depth - 1)
+            return from_primvar(primvar, fallback)
         if identifier.startswith("ND_"):
             if name.startswith(("image_", "tiledimage_")):
                 return self._image(node, name)
@@ -255,10 +103,7 @@ class Network:
         """MaterialX's arithmetic; None if the node is none."""
 
         def get(key: str, *default: float) -> Signal:
-            found = self._input(node.GetInput(key), constant(*default), depth)
-            if found.primvar:
-                self.warn(f"arithmetic on the primvar '{found.primvar}' is not read: it counts as its fallback")
-            return replace(found, primvar="")
+            return self._input(node.GetInput(key), constant(*default), depth)
 
         kind = name.split("_")[0]
         if kind == "constant":
@@ -296,6 +141,11 @@ class Network:
             return combine(kind, np.subtract, get("amount", 1.0), get("in", 0.0))
         if kind == "clamp":
             return combine(kind, np.clip, get("in", 0.0), get("low", 0.0), get("high", 1.0))
+        if kind == "normalmap":
+            if self._text(node.GetInput("space"), "tangent") != "tangent":
+                raise Unreadable("only normal maps in tangent space are read")
+            weight = get("scale", 1.0)
+            return combine(kind, _unpacked_normal, as_color(get("in", 0.5, 0.5, 1.0)), weight)
         if kind == "luminance":
             weights = np.array([0.2126729, 0.7151522, 0.0721750])
             return combine(
@@ -311,7 +161,9 @@ class Network:
         attribute = value.producer(node.GetInput("file"))
         space = self._text(node.GetInput("sourceColorSpace"), "auto")
         try:
-            image, pixels, key, atlas = self._pixels(attribute, space, fallback, channels)
+            image, pixels, key, atlas = self._images.look_up(
+                attribute, self._time, space, fallback, channels, self.warn
+            )
         except Unreadable as trouble:
             self.warn(f"{trouble}; the texture's fallback is used")
             return constant(*fallback[channels].tolist())
@@ -340,7 +192,9 @@ class Network:
         try:
             space = "auto" if wanted.startswith("color") else "raw"
             channels = list(range(count))
-            _, pixels, key, atlas = self._pixels(attribute, space, np.resize(default, 4), channels)
+            _, pixels, key, atlas = self._images.look_up(
+                attribute, self._time, space, np.resize(default, 4), channels, self.warn
+            )
         except Unreadable as trouble:
             self.warn(f"{trouble}; the image's default is used")
             return constant(*default.tolist())
@@ -361,60 +215,6 @@ class Network:
         """The path that an asset attribute holds."""
         asset = value.raw(attribute, self._time) if attribute is not None else None
         return asset.path if isinstance(asset, Sdf.AssetPath) else str(asset or "")
-
-    def _pixels(
-        self, attribute: Usd.Attribute | None, space: str, fallback: Floats, channels: list[int]
-    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
-        """The image that an attribute names: itself, some of its channels rgba [h, w, c], a key, its UDIM tiles."""
-        asset = value.raw(attribute, self._time) if attribute is not None else None
-        if isinstance(asset, str):
-            asset = Sdf.AssetPath(asset)
-        if attribute is None or not isinstance(asset, Sdf.AssetPath) or not asset.path:
-            raise Unreadable("no image file is named")
-        authored = str(attribute.GetColorSpace() or "")
-        if space == "auto" and authored in _SRGB_NAMES:
-            space = "sRGB"
-        elif space == "auto" and authored and authored != "auto":
-            space = "raw"
-        if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
-            return self._udim(attribute, asset, space, fallback, channels)
-        image = self._images.read(asset, space)
-        pixels = _converted(_channels(image, channels), authored)
-        return image, pixels, (asset.resolvedPath or asset.path, space, authored), (1, 1)
-
-    def _udim(
-        self, attribute: Usd.Attribute, asset: Sdf.AssetPath, space: str, fallback: Floats, channels: list[int]
-    ) -> tuple[Image, Floats, Hashable, tuple[int, int]]:
-        """The tiles of a UDIM set side by side in one image; those that are missing show the fallback."""
-        stack = attribute.GetPropertyStack(self._time)
-        tiles = UsdShade.UdimUtils.ResolveUdimTilePaths(asset.path, stack[0].layer if stack else None)
-        places = {int(number) - 1001: str(path) for path, number in tiles if str(number).isdigit()}
-        places = {at: path for at, path in places.items() if 0 <= at < 100}
-        if not places:
-            raise Unreadable(f"image '{asset.path}': no tile of it exists")
-        images: dict[int, Image] = {}
-        for at, path in sorted(places.items()):
-            try:
-                images[at] = self._images.read(asset, space, path)
-            except Unreadable as trouble:
-                self.warn(f"{trouble}; the texture's fallback is used")
-        if not images:
-            raise Unreadable(f"image '{asset.path}': no tile of it can be read")
-        columns, rows = max(at % 10 for at in images) + 1, max(at // 10 for at in images) + 1
-        height = max(image.pixels.shape[0] for image in images.values())
-        width = max(image.pixels.shape[1] for image in images.values())
-        shrink = math.sqrt(min(MAX_PIXELS / (height * width * columns * rows), 1.0))
-        height, width = max(int(height * shrink), 1), max(int(width * shrink), 1)
-        atlas = np.empty((rows * height, columns * width, len(channels)), np.float16)
-        atlas[:] = fallback[channels]
-        for at, image in images.items():
-            tile = _channels(image, channels)
-            if tile.shape[:2] != (height, width):
-                tile = resized(tile, height, width)
-            top, left = (rows - 1 - at // 10) * height, at % 10 * width
-            atlas[top : top + height, left : left + width] = tile
-        first = next(iter(images.values()))
-        return first, atlas, (asset.path, tuple(sorted(places.items())), space), (columns, rows)
 
     def _coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
         """The uv set that an input reads, and what is done to it, [3, 3]."""
@@ -455,7 +255,10 @@ class Network:
 
     def _constant(self, node: UsdShade.Shader, name: str, default: list[float]) -> Floats:
         """An input's numbers, float64 [c]; a network's are averaged."""
-        found = self._input(node.GetInput(name), constant(*default), 2).mean
+        signal = self._input(node.GetInput(name), constant(*default), 2)
+        if signal.primvars:
+            self.warn(f"{name} reads the primvar '{signal.primvars[0].name}': it takes the reader's fallback")
+        found = signal.mean
         return found if len(found) == len(default) else np.resize(found, len(default))
 
     def _text(self, shader_input: UsdShade.Input, default: str = "") -> str:
@@ -463,30 +266,10 @@ class Network:
         return value.text(attribute, self._time, default) or default if attribute is not None else default
 
 
-def _channels(image: Image, channels: list[int]) -> Floats:
-    """Channels of an image as if it had r, g, b and a, [h, w, c]; without a copy where possible."""
-    pixels, count = image.pixels, image.pixels.shape[2]
-    if channels == [0, 1, 2] and count >= 3:
-        return pixels[..., :3]
-    if channels == [3]:
-        return image.alpha[..., None]
-    planes = [image.rgb[..., c] if c < 3 else image.alpha for c in channels]
-    return planes[0][..., None] if len(planes) == 1 else np.stack(planes, axis=-1)
-
-
-def _converted(pixels: Floats, space: str) -> Floats:
-    """Linear pixels [h, w, 3 or 4] of a colour space as Rec.709; fewer channels are no colour."""
-    if pixels.shape[2] < 3:
-        return pixels
-    name = _LINEAR_NAMES.get(space.lower(), space)
-    if name.lower() in _UNSAID or space in _SRGB_NAMES or not Gf.ColorSpace.IsValid(name):
-        return pixels
-    target, source = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709), Gf.ColorSpace(name)
-    if source.GetGamma() != 1.0:
-        return pixels
-    matrix = np.array([target.Convert(source, Gf.Vec3f(*axis)).GetRGB() for axis in np.eye(3).tolist()])
-    rgb = np.maximum(np.asarray(pixels[..., :3], np.float32) @ matrix.astype(np.float32), 0.0)
-    return np.concatenate([rgb, pixels[..., 3:]], axis=-1)
+def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
+    """Normals from numbers between 0 and 1, by MaterialX's node normalmap, whose scale is for x and y."""
+    across = np.broadcast_to(scale, (*scale.shape[:-1], 2))
+    return np.asarray((2.0 * packed - 1.0) * np.concatenate([across, np.ones_like(scale[..., :1])], axis=-1))
 
 
 def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> Place:

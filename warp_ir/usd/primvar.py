@@ -46,27 +46,23 @@ def expand(shape: Shape, values: Floats, interpolation: str, indices: Ints | Non
     return values[shape.triangles]
 
 
-def display_color(
-    prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report, name: str = "displayColor"
+def corner_values(
+    prim: Usd.Prim, shape: Shape, name: str, channels: int, time: Usd.TimeCode, report: Report
 ) -> Floats | None:
-    """The prim's own or inherited displayColor: float64 [3] if it is one colour, [m, 3, 3] if not, None if unset.
+    """The prim's own or inherited primvar: float64 [c] if it is one value, [m, 3, c] if not, None if unset.
 
-    A primvar with a wrong number of values is reduced to its first value, and named; so is a displayOpacity below 1.
-    `name` is that of another primvar to be read likewise.
+    Colours are taken to linear Rec. 709. A primvar with a wrong number of values is reduced to its first, and named.
     """
-    opacity = np.asarray(
-        value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
-    )
-    if opacity.dtype.kind == "f" and (opacity < 1.0).any():
-        report.warn(prim.GetPath(), "displayOpacity is not honoured: it is drawn opaque ({n} in all)")
     found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
     if not found or not found.HasValue():
         return None
     try:
-        values = value.floats(found.GetAttr(), time, 3)
+        values = _rows(found.GetAttr(), time, channels)
         if values is None or len(values) == 0:
             return None
-        values = value.to_linear_rec709(found.GetAttr(), values)
+        if channels >= 3 and value.is_color(found.GetAttr()):
+            rgb = value.to_linear_rec709(found.GetAttr(), values[:, :3])
+            values = np.concatenate([rgb, values[:, 3:]], axis=1)
         indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{trouble}; {name} ignored")
@@ -74,18 +70,52 @@ def display_color(
     if not np.isfinite(values).all():
         report.warn(prim.GetPath(), f"{name} has values that are not finite, taken as 0")
         values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
-    if values.min() < 0.0 or values.max() > 1.0:
-        report.warn(prim.GetPath(), f"{name} outside [0, 1] clamped")
-        values = values.clip(0.0, 1.0)
     try:
-        colors = expand(shape, values, found.GetInterpolation(), indices)
+        corners = expand(shape, values, found.GetInterpolation(), indices)
     except Unreadable as trouble:
         report.warn(prim.GetPath(), f"{name}: {trouble}; its first value is used throughout")
-        colors = values[:1, None]
-    if len(colors) == 0 or (colors == colors[0, 0]).all():
-        first: Floats = colors[0, 0] if len(colors) else values[0]
+        corners = values[:1, None]
+    if len(corners) == 0 or (corners == corners[0, 0]).all():
+        first: Floats = corners[0, 0] if len(corners) else values[0]
         return first
-    return colors
+    return corners
+
+
+def _rows(attribute: Usd.Attribute, time: Usd.TimeCode, channels: int) -> Floats | None:
+    """The values of a primvar, [v, c]; it may be a single one that is no array."""
+    single = np.asarray(value.raw(attribute, time))
+    if single.shape == ((channels,) if channels > 1 else ()) and single.dtype.kind in "fiu":
+        return single.reshape(1, channels).astype(np.float64)
+    if channels > 1:
+        return value.floats(attribute, time, channels)
+    values = value.scalars(attribute, time)
+    return None if values is None else values[:, None]
+
+
+def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Floats | None:
+    """The prim's own or inherited displayColor as an albedo, as `corner_values` has it."""
+    colors = corner_values(prim, shape, "displayColor", 3, time, report)
+    if colors is None:
+        return None
+    if colors.min() < 0.0 or colors.max() > 1.0:
+        report.warn(prim.GetPath(), "displayColor outside [0, 1] clamped")
+    return colors.clip(0.0, 1.0)
+
+
+def display_opacity(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> float:
+    """The prim's own or inherited displayOpacity, 1 if unset; the mean of the corners where it differs, and named."""
+    authored = value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
+    if np.all(np.asarray(1.0 if authored is None else authored) == 1.0):
+        return 1.0
+    found = corner_values(prim, shape, "displayOpacity", 1, time, report)
+    if found is None:
+        return 1.0
+    if found.ndim > 1:
+        report.warn(prim.GetPath(), "displayOpacity differs over the surface: its mean is used")
+    opacity = float(found.clip(0.0, 1.0).mean())
+    if 0.0 < opacity < 1.0:
+        report.warn(prim.GetPath(), "partial opacity lets a share of the light through, straight on ({n} in all)")
+    return opacity
 
 
 def texture_coordinates(prim: Usd.Prim, shape: Shape, name: str, time: Usd.TimeCode, report: Report) -> Floats | None:

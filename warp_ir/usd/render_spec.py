@@ -6,12 +6,15 @@ from dataclasses import dataclass, field, fields
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
 
-from pxr import Gf, Tf, Usd, UsdGeom, UsdRender
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender
 
+from warp_ir.color_space import COLOR_SPACES
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.usd import value
-from warp_ir.usd.report import Report
+from warp_ir.usd.binding import PURPOSES
+from warp_ir.usd.color import color_space
+from warp_ir.usd.report import Report, Unreadable
 
 _OURS = "warp_ir:"
 """Namespace of attributes that are fields of `RenderSettings`."""
@@ -28,9 +31,6 @@ _AOVS = {
     **dict.fromkeys(("primid", "prim_id", "id"), "prim_id"),
 }
 """What other renderers call the AOVs that a film has, in lower case."""
-_LOOKS = ["full", ""]
-"""The material purposes of the schema, and ours."""
-_LINEAR_REC709 = {"", "lin_rec709_scene", "lin_rec709", "LinearRec709", "linear", "raw", "data"}
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class RenderSpec:
     """Of the prim; "" if the stage has none."""
     purposes: tuple[str, ...] | None = None
     """What to draw, if that is authored."""
+    material_purposes: tuple[str, ...] = PURPOSES[:2]
+    """Of the bindings of materials, in the order in which they are wanted."""
     products: tuple[Product, ...] = (Product(),)
     """At least one."""
 
@@ -76,7 +78,7 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
     chosen = _choose(stage, name, report)
     if chosen is None:
         return RenderSpec()
-    base = _fields(chosen, time, report, everything=True)
+    base = {**_fields(chosen, time, report, everything=True), **_color_space(chosen, time, report)}
     camera = _camera(chosen, report)
     products = []
     for path in value.targets(UsdRender.Settings(chosen).GetProductsRel()):
@@ -99,16 +101,16 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
     purposes = UsdRender.Settings(chosen).GetIncludedPurposesAttr()
     names = value.tokens(purposes, time) if purposes.HasAuthoredValue() else []
     known = tuple(name for name in names if name in UsdGeom.Imageable.GetOrderedPurposeTokens())
-    _warn_of_color(chosen, time, report)
     bindings = UsdRender.Settings(chosen).GetMaterialBindingPurposesAttr()
-    looks = value.tokens(bindings, time) if bindings.HasAuthoredValue() else _LOOKS
+    looks = value.tokens(bindings, time) if bindings.HasAuthoredValue() else PURPOSES[:2]
     # The schema calls "" so in a sentence, and many files quote it.
     looks = ["" if name == "allPurpose" else name for name in looks]
-    if looks != _LOOKS:
-        report.warn(chosen.GetPath(), f"materialBindingPurposes {looks}: materials of purpose 'full' are used first")
+    if strange := [name for name in looks if name and not Sdf.Path.IsValidIdentifier(name)]:
+        report.warn(chosen.GetPath(), f"materialBindingPurposes: {strange} cannot be purposes and are ignored")
     return RenderSpec(
         str(chosen.GetPath()),
         known or None,
+        tuple(name for name in looks if name not in strange),
         tuple(products) or (Product(camera=camera, settings=base),),
     )
 
@@ -239,7 +241,21 @@ def _file_name(product: Usd.Prim, time: Usd.TimeCode, report: Report) -> str:
     return base if PurePosixPath(base).suffix else f"{base}.exr"
 
 
-def _warn_of_color(settings: Usd.Prim, time: Usd.TimeCode, report: Report) -> None:
-    space = value.text(UsdRender.Settings(settings).GetRenderingColorSpaceAttr(), time)
-    if space not in _LINEAR_REC709:
-        report.warn(settings.GetPath(), f"renderingColorSpace '{space}': light is computed in linear Rec. 709")
+def _color_space(settings: Usd.Prim, time: Usd.TimeCode, report: Report) -> dict[str, Any]:
+    """The field of `RenderSettings` that renderingColorSpace sets: the colour space of what is written."""
+    name = value.text(UsdRender.Settings(settings).GetRenderingColorSpaceAttr(), time)
+    try:
+        space = color_space(name)
+    except Unreadable as trouble:
+        report.warn(settings.GetPath(), f"renderingColorSpace: {trouble}; linear Rec. 709 is used")
+        return {}
+    if space is None:
+        return {}
+    if space.GetName() not in COLOR_SPACES:
+        report.warn(settings.GetPath(), f"renderingColorSpace '{name}' is not linear, or not known; Rec. 709 is used")
+        return {}
+    report.warn(
+        settings.GetPath(),
+        f"renderingColorSpace '{name}': light is computed in Rec. 709, linear pictures are converted",
+    )
+    return {"color_space": str(space.GetName())}

@@ -9,6 +9,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from warp_ir.scene import InputError
 from warp_ir.usd.crate import check_sizes
+from warp_ir.usd.redirect import with_documents
 from warp_ir.usd.report import Report
 
 _SHOWN = 5
@@ -59,26 +60,34 @@ def open_stage(
     if session_layer is not None:
         stronger = _layer(session_layer)
         session.subLayerPaths.append(stronger.identifier)
+    wanted = [text for text in needed if Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsPrimPath()]
+    paths = [*mask, *wanted] if mask else []
     try:
-        if mask:
-            paths = [text for text in needed if Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsPrimPath()]
-            stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask([*mask, *paths]))
-            stage.ExpandPopulationMask()
-        else:
-            stage = Usd.Stage.Open(root, session)
+        stage = _composed(root, session, paths)
+        for text in mask:
+            if not stage.GetPrimAtPath(text):
+                raise InputError(f"mask: there is no prim {text}")
+        for text in variants:
+            _select_variant(stage, text)
+        instead = with_documents(stage, report)
+        if instead:
+            stage = _composed(instead[0], session, paths)
     except (Tf.ErrorException, RuntimeError) as error:
         raise _unopened(path, error) from None
-    for text in mask:
-        if not stage.GetPrimAtPath(text):
-            raise InputError(f"mask: there is no prim {text}")
-    for text in variants:
-        _select_variant(stage, text)
     errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
     for text in list(errors)[:_SHOWN]:
         report.warn("/", f"composition: {text}")
     if len(errors) > _SHOWN:
         report.warn("/", f"composition: {len(errors) - _SHOWN} more errors")
     report.stats["composition_errors"] = len(errors)
+    return stage
+
+
+def _composed(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.Stage:
+    if not mask:
+        return Usd.Stage.Open(root, session)
+    stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask(list(mask)))
+    stage.ExpandPopulationMask()
     return stage
 
 
@@ -161,5 +170,6 @@ def first_message(error: Exception) -> str:
 
 
 def _tidy(message: str) -> str:
-    words = " ".join(message.split())
+    # Layers in memory are called by where they lie there, and by their name.
+    words = re.sub(r"anon:0x[0-9a-fA-F]+:", "", " ".join(message.split()))
     return words if len(words) <= 300 else words[:299] + "…"

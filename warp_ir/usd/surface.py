@@ -6,16 +6,18 @@ that share of the rays through, straight on; emission is lost with it.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
+from warp_ir.usd.images import Images
 from warp_ir.usd.light import BRIGHTEST
-from warp_ir.usd.network import Images, Network, Signal, as_color, combine, constant
+from warp_ir.usd.network import Network
 from warp_ir.usd.report import Unreadable
+from warp_ir.usd.signal import Place, Signal, as_color, combine, constant
 
 _GREY: Color = (0.18, 0.18, 0.18)
 _BLACK: Color = (0.0, 0.0, 0.0)
@@ -27,8 +29,8 @@ class Surface:
     """What a material looks like."""
 
     material: Material
-    primvar: str = ""
-    """Where surfaces have a primvar of this name, it is their albedo."""
+    albedo: Signal | None = None
+    """If it depends on primvars: what the albedo is where surfaces have them."""
 
 
 def read_material(
@@ -75,17 +77,46 @@ class _Inputs:
 
     def color(self, name: str, default: Color) -> Signal:
         """A colour."""
-        found = self.network.evaluate(self._shader.GetInput(name), constant(*default))
-        if found.primvar and name not in ("diffuseColor", "base_color"):
-            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
-        return as_color(found)
+        return as_color(self.network.evaluate(self._shader.GetInput(name), constant(*default)))
 
     def grey(self, name: str, default: float) -> Signal:
         """One channel."""
         found = self.network.evaluate(self._shader.GetInput(name), constant(default))
-        if found.primvar:
-            self.warn(f"{name} reads the primvar '{found.primvar}': it takes the reader's fallback")
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
+
+    def normal(self, name: str, *, tangent: bool) -> Signal | None:
+        """A normal map, in tangent space; None where there is none, or a flat one.
+
+        Args:
+            name: Of the input.
+            tangent: Whether the input itself is in tangent space; otherwise a node `normalmap` has to feed it.
+        """
+        given = value.producer(self._shader.GetInput(name))
+        if given is None:
+            return None
+        if not tangent:
+            if not UsdShade.Output.IsOutput(given):
+                return None
+            node = str(UsdShade.Shader(given.GetPrim()).GetShaderId() or "an unnamed node")
+            if not node.startswith("ND_normalmap"):
+                self.warn(f"{name}: only a normalmap is read, not {node}; the surface's own normals are used")
+                return None
+        found = as_color(self.network.evaluate(self._shader.GetInput(name), constant(0.0, 0.0, 1.0)))
+        self.without_primvars(name, found)
+        if np.abs(found.pixels).max() > 1.0:
+            found = combine("normal", lambda n: np.clip(n, -1.0, 1.0), found)
+        x, y, z = found.mean.tolist()
+        if found.place is None:
+            return None if x == y == 0.0 else replace(found, place=Place())  # one texel
+        if math.hypot(x, y) > 0.5 * abs(z):
+            self.warn(f"{name}: the map leans to one side; is it raw, with scale 2 and bias -1 ({{n}} materials)?")
+        # Beyond an image that ends, the surface is smooth.
+        return replace(found, outside=np.array([0.0, 0.0, 1.0]), key=("normal", found.key))
+
+    def without_primvars(self, what: str, signal: Signal) -> None:
+        """Name the primvars that count as their readers' fallbacks."""
+        for primvar in signal.primvars:
+            self.warn(f"{what} reads the primvar '{primvar.name}': it takes the reader's fallback")
 
     def unread(self, *names: str) -> None:
         """Name the inputs that are authored in vain."""
@@ -94,9 +125,17 @@ class _Inputs:
             if given is not None and UsdShade.Output.IsOutput(given):
                 self.warn(f"{name} is not rendered ({{n}} materials)")
 
+    def unrendered(self, name: str, what: str) -> None:
+        """Say that something is not rendered, if its weight is not 0."""
+        weight = self.grey(name, 0.0)
+        if weight.pixels.max() > 0.0 or weight.primvars:
+            self.warn(f"{what} is not rendered ({{n}} materials)")
+
     def number(self, name: str, default: float) -> float:
         """A number; the mean where it comes from an image."""
-        return float(self.grey(name, default).mean[0])
+        found = self.grey(name, default)
+        self.without_primvars(name, found)
+        return float(found.mean[0])
 
 
 def _mean_channel(pixels: Floats) -> Floats:
@@ -115,7 +154,8 @@ def _preview_surface(inputs: _Inputs) -> Surface | None:
     else:
         albedo = _metal(inputs, "metallic", albedo)
     emission = inputs.color("emissiveColor", _BLACK)
-    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0))
+    opacity, threshold = inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
+    return _surface(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
 
 
 def _standard_surface(inputs: _Inputs) -> Surface | None:
@@ -124,8 +164,10 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
+    albedo = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
     albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
-    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0)
+    inputs.unrendered("sheen", "sheen")
+    return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False))
 
 
 def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
@@ -134,8 +176,11 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
+    albedo = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
     albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
-    return _surface(inputs, albedo, emission, inputs.grey("geometry_opacity", 1.0), 0.0)
+    inputs.unrendered("fuzz_weight", "sheen")
+    opacity, normal = inputs.grey("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
+    return _surface(inputs, albedo, emission, opacity, 0.0, normal)
 
 
 _READERS = {
@@ -151,7 +196,7 @@ def _unit(pixels: Floats) -> Floats:
 
 
 def _scaled(color: Signal, weight: Signal) -> Signal:
-    if weight.place is None and weight.mean[0] == 1.0:
+    if weight.place is None and not weight.primvars and weight.mean[0] == 1.0:
         return color
     return combine("scaled", np.multiply, color, weight)
 
@@ -159,7 +204,7 @@ def _scaled(color: Signal, weight: Signal) -> Signal:
 def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
     """The albedo of a surface that may be a metal, of which only its base colour is left, or nothing."""
     metallic = inputs.grey(name, 0.0)
-    if metallic.pixels.max() <= 0.0:
+    if metallic.pixels.max() <= 0.0 and not metallic.primvars:
         return albedo
     if not inputs.black_metals:
         inputs.warn("metal rendered as a diffuse surface of its base colour ({n} materials)")
@@ -168,25 +213,44 @@ def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
     return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
 
 
+def _scattering(inputs: _Inputs, weight: str, metalness: str, default: Color, albedo: Signal) -> Signal:
+    """The albedo of a surface of which a part scatters light below it: as reflected from its colour, where it entered.
+
+    Metals let no light in.
+    """
+    share = inputs.grey(weight, 0.0)
+    if share.pixels.max() <= 0.0 and not share.primvars:
+        return albedo
+    inputs.warn("subsurface scattering rendered as diffuse reflection ({n} materials)")
+
+    def mixed(base: Floats, color: Floats, part: Floats, metal: Floats) -> Floats:
+        part = _unit(part) * (1.0 - _unit(metal))
+        return np.asarray(base * (1.0 - part) + color * part)
+
+    color = inputs.color("subsurface_color", default)
+    return combine("subsurface", mixed, albedo, color, share, inputs.grey(metalness, 0.0))
+
+
 def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
     """The albedo below a coat, whose colour filters what comes back: lacquered metals get theirs from it."""
     coat = inputs.grey(weight, 0.0)
-    if coat.pixels.max() <= 0.0:
+    if coat.pixels.max() <= 0.0 and not coat.primvars:
         return albedo
     tint = inputs.color("coat_color", _WHITE)
-    if tint.pixels.min() >= 1.0:
-        return albedo
-    if albedo.primvar:
-        inputs.warn(f"coat_color does not tint the primvar '{albedo.primvar}'")
+    if tint.pixels.min() >= 1.0 and not tint.primvars:
         return albedo
     return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _unit(t))), albedo, coat, tint)
 
 
-def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float) -> Surface | None:
+def _surface(
+    inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float, normal: Signal | None
+) -> Surface | None:
     """A record with an albedo that conserves energy and an emission that exists; None if nothing is there."""
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _unit, albedo)
+    inputs.without_primvars("emission", emission)
+    inputs.without_primvars("opacity", opacity)
     if float(emission.pixels.max()) >= BRIGHTEST:
         inputs.warn(f"emission {_numbers(emission)} is beyond reason; it emits nothing")
         emission = constant(*_BLACK)
@@ -204,7 +268,7 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
         inputs.warn("partial opacity lets a share of the light through, straight on ({n} materials)")
-    inputs.unread("normal", "displacement", "geometry_normal")
+    inputs.unread("displacement")
     network = inputs.network
     textured = opacity.place is not None and not opaque
     material = Material(
@@ -216,8 +280,9 @@ def _surface(inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal,
         None if albedo.place is None else network.texture(_bounded(albedo)),
         None if emission.place is None or emission.pixels.max() == 0.0 else network.texture(_bounded(emission)),
         network.texture(_bounded(opacity)) if textured else None,
+        normal_texture=None if normal is None else network.texture(normal),
     )
-    return Surface(material, albedo.primvar)
+    return Surface(material, albedo if albedo.primvars else None)
 
 
 def _bounded(signal: Signal) -> Signal:

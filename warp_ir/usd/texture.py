@@ -7,6 +7,7 @@ for is averaged down while it is read, a band of rows at a time.
 import math
 import os
 import tempfile
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ import numpy.typing as npt
 from pxr import Ar, Sdf
 
 from warp_ir.scene import Floats
+from warp_ir.usd.color import color_space as named
+from warp_ir.usd.color import decoder, srgb_to_linear
 from warp_ir.usd.report import Unreadable
 
 if TYPE_CHECKING:
@@ -65,7 +68,8 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
         asset: As an attribute gives it, resolved by USD; or a resolved path, which may lie in a package
             (`a.usdz[b.png]`).
         color_space: UsdUVTexture's sourceColorSpace: "raw", "sRGB", or "auto": sRGB for 8 bits and three or four
-            channels unless the file says otherwise. Only colour is ever decoded, never alpha.
+            channels unless the file says otherwise; or another colour space, of which the primaries are kept. Only
+            colour is ever decoded, never alpha.
         max_pixels: An image with more is averaged down by a whole factor.
 
     Raises:
@@ -93,12 +97,6 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
         finally:
             if reader is not None:
                 reader.close()
-
-
-def srgb_to_linear(values: Floats) -> Floats:
-    """The inverse of sRGB's transfer function; values above 1 continue it."""
-    low = values <= 0.04045
-    return np.where(low, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 @contextmanager
@@ -135,8 +133,9 @@ def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
         factor += 1
     # Bytes become light by a table.
     bytes_only = spec.format.basetype == oiio.UINT8
-    colors = (count if count in (1, 3) else count - 1) if _is_srgb(spec, color_space, bytes_only) else 0
-    table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+    decode = _decoder(spec, color_space, bytes_only)
+    colors = 0 if decode is None else count if count in (1, 3) else count - 1
+    table = None if decode is None else decode(np.arange(256) / 255.0).astype(np.float32)
     small = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
     tile = int(spec.tile_height) or 1
     step = math.lcm(factor, tile)  # a band is whole rows of the result, and of tiles
@@ -152,8 +151,8 @@ def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
             raise Unreadable(f"cannot be read: {_first_line(reader.geterror(), path)}")
         stored = np.asarray(band).reshape(bottom - top, width, count)
         values = stored.astype(np.float32) / np.float32(255.0 if bytes_only else 1.0)
-        if colors:
-            values[..., :colors] = table[stored[..., :colors]] if bytes_only else srgb_to_linear(values[..., :colors])
+        if decode is not None and table is not None:
+            values[..., :colors] = table[stored[..., :colors]] if bytes_only else decode(values[..., :colors])
         small[top // factor : -(-bottom // factor)] = _averaged(values, factor)
     if not np.isfinite(small).all():
         small = np.nan_to_num(small, nan=0.0, posinf=65504.0, neginf=0.0)
@@ -182,14 +181,14 @@ def _channels(names: list[str]) -> tuple[int, int]:
     return 0, min(len(names), 4)
 
 
-def _is_srgb(spec: Any, color_space: str, bytes_only: bool) -> bool:
-    if color_space in ("sRGB", "raw"):
-        return color_space == "sRGB"
+def _decoder(spec: Any, color_space: str, bytes_only: bool) -> Callable[[Floats], Floats] | None:
+    """What makes colour linear; None if it is, or is no colour."""
+    if color_space != "auto":
+        space = named(color_space)
+        return None if space is None else decoder(space)
     says = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
-    if says in _RAW:
-        return False
     # OpenImageIO calls every PNG sRGB, whether the file does or not: only what the pixels are decides then.
-    return bytes_only and spec.nchannels in (3, 4)
+    return srgb_to_linear if says not in _RAW and bytes_only and spec.nchannels in (3, 4) else None
 
 
 def _wrap_modes(spec: Any) -> tuple[str, str]:

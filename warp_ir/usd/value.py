@@ -3,13 +3,11 @@
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdShade
+from pxr import Sdf, Tf, Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Ints
+from warp_ir.usd.color import to_rec709
 from warp_ir.usd.report import Unreadable
-
-_AS_IS = tuple(getattr(Gf.ColorSpaceNames, n) for n in ("LinearRec709", "Data", "Raw", "Unknown", "Identity"))
-"""Colour spaces whose numbers are used as they are."""
 
 
 def raw(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
@@ -122,15 +120,15 @@ def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color
 
 def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
     """Colours [n, 3] of an attribute, taken from its colour space (its own, its prim's or an ancestor's)."""
-    name = Usd.ColorSpaceAPI.ComputeColorSpaceName(attribute, None)
-    if not name or name in _AS_IS:
-        return colors
-    if not Gf.ColorSpace.IsValid(name):
-        raise Unreadable(f"{attribute.GetName()} has the unknown colour space '{name}'")
-    target, source = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709), Gf.ColorSpace(name)
-    unique, where = np.unique(colors, axis=0, return_inverse=True)
-    converted = [target.Convert(source, Gf.Vec3f(*c)).GetRGB() for c in unique.tolist()]
-    return np.array(converted, dtype=np.float64).reshape(-1, 3)[where.reshape(-1)]
+    try:
+        return to_rec709(colors, str(Usd.ColorSpaceAPI.ComputeColorSpaceName(attribute, None) or ""))
+    except Unreadable as trouble:
+        raise Unreadable(f"{attribute.GetName()} has the {trouble}") from None
+
+
+def is_color(attribute: Usd.Attribute) -> bool:
+    """Whether an attribute of three numbers holds a colour, and not a vector, which no colour space is for."""
+    return bool(attribute.GetRoleName() == Sdf.ValueRoleNames.Color or attribute.HasColorSpace())
 
 
 def targets(relationship: Usd.Relationship) -> list[Sdf.Path]:
