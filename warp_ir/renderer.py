@@ -23,7 +23,7 @@ from typing import Any
 
 import warp as wp
 
-import warp_ir.bvh
+import warp_ir.bvh.build
 import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
@@ -265,7 +265,7 @@ def trace_vpls(
 
 def _modules(estimator: str, launcher: Launcher) -> list[Any]:
     """What has kernels that an estimator needs, those that take longest to compile first."""
-    common = [warp_ir.gbuffer, *([warp_ir.bvh] if launcher.device.is_cpu else []), warp_ir.film]
+    common = [warp_ir.gbuffer, *([warp_ir.bvh.build] if launcher.device.is_cpu else []), warp_ir.film]
     if estimator == "vpl":
         return [
             warp_ir.reconstruction,
