@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 _REGISTERS, _FRAME = 0x2F, 0x11  # EIATTR_REGCOUNT, EIATTR_FRAME_SIZE
 _MOST_REGISTERS = 128
-_MOST_LOCAL = 64
+_MOST_LOCAL = 128  # an array of a few boxes, which a loop indexes
 PACKAGE = Path(ir.__file__).parent
 KERNEL_MODULES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))

@@ -30,12 +30,11 @@ def scene_bytes(scene: Scene) -> dict[str, int]:
     With the moments of an open shutter; what they share counts once. Films and VPLs are not in it.
     """
     out = dict.fromkeys(("geometry", "hierarchy", "instances", "textures", "lights"), 0.0)
+    moments = {tuple(id(x) for x in (*m.meshes, *m.instances)): m for m in scene.shutter or (scene,)}
     seen: set[object] = set()
-    for moment in scene.shutter or (scene,):
-        same = tuple(id(x) for x in (*moment.meshes, *moment.instances))
-        if same not in seen:
-            seen.add(same)
-            _add_surfaces(moment, out)
+    triangles = sum(_add_surfaces(moment, out, seen) for moment in moments.values())
+    for moment in moments.values():
+        _add_emitters(moment, triangles, out)
     textures = {texture for material in scene.materials for texture in material.textures}
     out["textures"] = min(sum(_CHAIN * _TEXEL * texture.pixels.size for texture in textures), _MOST_TEXELS)
     out["lights"] = _of_lights(scene)
@@ -43,29 +42,45 @@ def scene_bytes(scene: Scene) -> dict[str, int]:
     return {name: round(size) for name, size in out.items()}
 
 
-def _add_surfaces(scene: Scene, out: dict[str, float]) -> None:
+def _add_surfaces(scene: Scene, out: dict[str, float], seen: set[object]) -> int:
+    """Counts what is not in `seen`, and puts it there; returns the triangles that this adds."""
     uv_sets = {texture.uv for material in scene.materials for texture in material.textures}
-    emits = np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
     triangles = 0
-    stored: set[object] = set()
-    for mesh, copies in _stored(scene, emits):
+    for mesh, copies in _stored(scene):
+        if id(mesh) in seen:
+            continue
         count = len(mesh.triangles) * copies
         triangles += count
         corners = _CORNER * 3 * ((mesh.normals is not None) + (mesh.colors is not None))
         corners += _UV * 3 * len(uv_sets) * any(name in mesh.uvs for name in uv_sets)
         out["geometry"] += count * (_TRIANGLE + _INDICES + corners)
-        out["geometry"] += _EMITTER * copies * float(emits[mesh.material].sum())
         geometry = id(mesh.points), id(mesh.triangles)
-        if geometry not in stored:  # prototypes of one geometry share points and hierarchy
-            stored.add(geometry)
+        if geometry not in seen:  # prototypes of one geometry share points and hierarchy
             out["geometry"] += _POINT * len(mesh.points) * copies
             out["hierarchy"] += _TREE * count
-    out["geometry"] += 4 * triangles * bool(emits.any())
-    out["instances"] += _INSTANCE * sum(len(group.matrices) for group in scene.instances)
+        seen |= {id(mesh), geometry}
+    groups = tuple(id(group) for group in scene.instances)
+    if groups not in seen:
+        out["instances"] += _INSTANCE * sum(len(group.matrices) for group in scene.instances)
+        seen.add(groups)
+    return triangles
 
 
-def _stored(scene: Scene, emits: npt.NDArray[np.bool_]) -> Iterator[tuple[Mesh, int]]:
+def _add_emitters(scene: Scene, triangles: int, out: dict[str, float]) -> None:
+    """Every moment has its own list of emitters, and the place in it of every triangle."""
+    emits = _emits(scene)
+    if emits.any():
+        out["geometry"] += 4 * triangles
+        out["geometry"] += _EMITTER * sum(copies * float(emits[m.material].sum()) for m, copies in _stored(scene))
+
+
+def _emits(scene: Scene) -> npt.NDArray[np.bool_]:
+    return np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
+
+
+def _stored(scene: Scene) -> Iterator[tuple[Mesh, int]]:
     """Every mesh that has triangles, and how often it is written out: once, unless it is instanced and emits."""
+    emits = _emits(scene)
     group_of: dict[int, Instances] = {k: group for group in scene.instances for k in group.meshes}
     for k, mesh in enumerate(scene.meshes):
         if len(mesh.triangles):
