@@ -25,8 +25,7 @@ from warp_ir.launch import Launcher
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_EDGE_RAYS = (16, 256)
-"""Camera rays for a pixel on an edge: at least, and at most; in between four for each iteration."""
+_MOST_EDGE_RAYS = 256
 _PROBES = wp.constant(8)  # of them, to see whether the edge is in the pixel
 _PRIOR = wp.constant(8.0)  # samples of its own that outweigh what the neighbours say about a pixel's noise
 _MATCH = wp.constant(0.2)  # of `same_surface`: below, a sample is not of that surface
@@ -232,6 +231,28 @@ def _interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.
 
 
 @wp.func
+def _differ(surfaces: Surfaces, p: int, q: int) -> bool:
+    """Whether two pixels show different surfaces, or only one shows any."""
+    if surfaces.footprint[p] <= 0.0 and surfaces.footprint[q] <= 0.0:
+        return False
+    return surfaces.footprint[q] <= 0.0 or same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q]) < _MATCH
+
+
+@wp.kernel
+def _find_edges(first: int, surfaces: Surfaces, out: wp.array[wp.int32]) -> None:
+    """1 where any of the eight neighbours shows something else."""
+    p = first + wp.tid()
+    out[p] = 0
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            x = p % surfaces.columns + dx
+            y = p // surfaces.columns + dy
+            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
+                if _differ(surfaces, p, y * surfaces.columns + x):
+                    out[p] = 1
+
+
+@wp.func
 def _on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
     """Whether any of the eight neighbours shows another surface, or none, or one that emits differently."""
     glow = film.emission[p][0] + film.emission[p][1] + film.emission[p][2]
@@ -242,13 +263,8 @@ def _on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
                 other = film.emission[q][0] + film.emission[q][1] + film.emission[q][2]
-                if wp.abs(other - glow) > wp.float64(0.01) * wp.max(other, glow):
+                if wp.abs(other - glow) > wp.float64(0.01) * wp.max(other, glow) or _differ(surfaces, p, q):
                     return True
-                if surfaces.footprint[q] > 0.0 or surfaces.footprint[p] > 0.0:
-                    if same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q]) < _MATCH:
-                        return True
-                    if surfaces.footprint[q] <= 0.0:
-                        return True
     return False
 
 
@@ -431,6 +447,15 @@ def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
         out.rows[1, p] = out.rows[1, p] + _color(i) * wp.max(1.0 - noise / (ratio[1] + 1.0e-30), 0.0)
 
 
+_FILTER_PASSES = 6.0
+"""Filtering takes as long as so many passes of camera rays: fewer where rays are dear."""
+
+
+def _edge_rays(iterations: int) -> int:
+    """Camera rays for a pixel on an edge: what edges lack then is little beside noise."""
+    return min(16 + 2 * iterations, _MOST_EDGE_RAYS)
+
+
 _NO_SUMS = ("surfaces", "noise", "seed")
 
 
@@ -451,6 +476,8 @@ class Reconstruction:
             surfaces.footprint = launcher.empty(pixels, wp.float32)
             trace_primary(scene, camera, launcher, gbuffer, iteration=-1, seed=0)
             launcher.launch(_look, pixels, [camera, gbuffer, surfaces])
+            launcher.launch(_find_edges, pixels, [surfaces, gbuffer.mesh])
+            self._on_edges = float(gbuffer.mesh.numpy().mean())
             seen = Observations()
             seen.surfaces = surfaces
             for name in ("direct", "indirect", "other_direct", "other_indirect"):
@@ -473,6 +500,10 @@ class Reconstruction:
         for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())
 
+    def passes(self, iterations: int) -> float:
+        """How many times as long as camera rays through all pixels `resolve` will take, roughly."""
+        return _FILTER_PASSES + self._on_edges * _edge_rays(iterations)
+
     def resolve(self, film: Any, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
         """Radiance by way of lights and of surfaces, from a `FilmData`: float32 [2, rows, columns, 3].
 
@@ -491,7 +522,7 @@ class Reconstruction:
             out = Picture()
             out.rows, out.rest = launcher.empty((5 if features else 2, pixels), wp.vec3), scratch
             out.iterations = iterations
-            out.edge_rays = min(max(4 * iterations, _EDGE_RAYS[0]), _EDGE_RAYS[1])
+            out.edge_rays = _edge_rays(iterations)
             inputs = [self._scene.data, self._camera, seen, layer, film, self._exposure, out]
             launcher.launch(_compose, pixels, inputs)
             launcher.launch(_correct_edges, pixels, [seen.surfaces, out])

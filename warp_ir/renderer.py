@@ -192,10 +192,11 @@ class Renderer:
         return film
 
     def _filter_seconds(self, film: Film, iterations: int) -> float:
-        """What filtering will take [s]: about as much as 16 passes of camera rays, edges included."""
+        """What filtering will take [s], told by what camera rays have taken."""
         if film.reconstruction is None:
             return 0.0
-        return 16.0 * self.launcher.profile.seconds().get("primary", 0.0) / iterations
+        camera_rays = self.launcher.profile.seconds().get("primary", 0.0) / iterations
+        return camera_rays * float(film.reconstruction.passes(film.iterations))
 
 
 @dataclass(frozen=True)
