@@ -115,6 +115,7 @@ def _observe(
 def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> None:
     """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours.
 
+    While every pixel has one sample, the spread from pixel to pixel serves.
     Of a few rays to many VPLs some arrive: the variance goes with the brightness, so that of the neighbours is scaled.
     """
     p = first + wp.tid()
@@ -123,18 +124,25 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
     spread = wp.vec2(0.0)
     around = wp.vec2(0.0)
     weights = float(0.0)
+    firsts = wp.vec2(0.0)
+    squares = wp.vec2(0.0)
+    samples = float(0.0)
     for dy in range(-2, 3):
         for dx in range(-2, 3):
             x = column + 2 * dx
             y = row + 2 * dy
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
-                if seen.count[q] > 1:
+                if seen.count[q] > 0:
                     w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
+                    sums = w * _means(seen.direct[q], seen.indirect[q])
                     w_free = w * float(seen.count[q] - 1)
                     spread += w * _spread(seen, q)
-                    around += w_free / float(seen.count[q]) * _means(seen.direct[q], seen.indirect[q])
+                    around += sums * (float(seen.count[q] - 1) / float(seen.count[q]))
                     weights += w_free
+                    firsts += sums
+                    squares += w * seen.squares[q]
+                    samples += w * float(seen.count[q])
     n = float(seen.count[p])
     out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
@@ -144,6 +152,10 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
         # Alone on its surface: as uncertain as it is bright.
         own = _means(direct, indirect)
         variance = wp.cw_mul(own, own)
+        if weights <= 1.0e-6 and samples > 2.0:
+            weights = samples
+            around = firsts
+            spread = wp.max(squares - wp.cw_mul(firsts, firsts) / samples, wp.vec2(0.0))
         if weights > 1.0e-6:
             around = around / weights + wp.vec2(1.0e-30)
             scale = wp.cw_div(n * own + _AROUND * around, (n + _AROUND) * around)
