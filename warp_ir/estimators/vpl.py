@@ -29,9 +29,9 @@ from warp_ir.vpl import emit_vpls
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _UNLIMITED = 2**31 - 1
-_SHADOW_RAYS = (2, 3)
+_SHADOW_RAYS = (4, 4)
 """Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
-_SHADOW_RAYS_AFTER = (1, 1)
+_SHADOW_RAYS_AFTER = (2, 2)
 """Where a compensation ray ends: such light has lost most of its weight."""
 _ROULETTE_DEPTH = wp.constant(2)
 _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the light paths
