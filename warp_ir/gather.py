@@ -34,7 +34,7 @@ BLOCKS_PER_SET = 16
 MAX_SETS = 64
 _INFINITE = 3.0e38
 _UNBOUNDED = wp.constant(_INFINITE)
-_AREAS = 8.0
+_AREAS = 20.0
 """The bound takes hold within a disk of as many times the area that a VPL stands for. Small: noise from VPLs close
 by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
 
