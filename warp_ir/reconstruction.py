@@ -408,7 +408,7 @@ def _compose(
             emitted = pixel.emission * exposure
         direct = pixel.direct * exposure
         indirect = pixel.indirect * exposure
-        if surfaces.footprint[p] > 0.0:
+        if film.hits[p] > 0:
             more = raw_direct - pixel.own_direct * exposure
             noise = pixel.own_noise * (exposure * exposure / n)
             out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])

@@ -63,6 +63,19 @@ def test_albedo_and_emission_stay_sharp(device):
     assert irradiance.std() / irradiance.mean() < 0.25  # the corners are darker or brighter; mixed albedos gave 0.6
 
 
+def test_thin_rims_lose_their_bias_too(device):
+    """A pixel whose centre shows nothing takes its light from neighbours; where they are lit otherwise, it learns."""
+    pictures = {}
+    for filtered in (False, True):
+        film = render(cornell_box(), "vpl", device, width=64, height=64, iterations=256, filter=filtered)
+        pictures[filtered] = film.radiance().mean(axis=-1)
+    rim = (film.aov("alpha") > 0.0) & (film.aov("alpha") < 0.5)
+    rim &= pictures[False] < 0.5  # not the lamp's
+    assert rim.sum() > 50
+    # Both pictures look along the same rays. Lit like their neighbours alone, these pixels would be 9 % too dark.
+    assert pictures[True][rim].sum() == pytest.approx(pictures[False][rim].sum(), rel=0.02)
+
+
 def test_direct_and_indirect_add_up(device):
     """The two parts of a filtered picture are the picture."""
     film = render(cornell_box(), "vpl", device, iterations=4, filter=True)
