@@ -170,11 +170,11 @@ class Surfaces:
         self._bvhs = self._trees.bring_together(worlds)
 
     def _numbers(self, layout: Layout) -> list[tuple[int, ...]]:
-        return [part.numbers for part in layout.head]
+        return [part.numbers for part in (*layout.head, *layout.tail)]
 
     def _number(self, layout: Layout) -> None:
-        """The numbers of meshes that stand still anew: others before them have come or gone."""
-        numbers = _numbered(layout.head)
+        """The numbers of all meshes anew: others before them have come or gone."""
+        numbers = _numbered([*layout.head, *layout.tail])
         if len(numbers):
             wp.copy(self._tables["triangle_mesh"].array, self._launcher.array(numbers, wp.int32))
 
