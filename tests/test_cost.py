@@ -3,6 +3,7 @@
 import gc
 import json
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,6 +87,11 @@ def moving():
     return ir.Scene(moments[0].meshes, shutter=moments)
 
 
+def moving_below_a_sky():
+    scene, sky = moving(), ir.Light("s", LightKind.DOME, (1,) * 3, texture=np.ones((256, 512, 3), np.float32))
+    return replace(scene, lights=(sky,), shutter=tuple(replace(moment, lights=(sky,)) for moment in scene.shutter))
+
+
 SCENES = {
     "cornell box": cornell_box,
     "furnace": lambda: furnace(level=5),
@@ -98,6 +104,7 @@ SCENES = {
     "lamps": lamps,
     "everything": everything,
     "moments": moving,
+    "moments below a sky": moving_below_a_sky,
 }
 
 

@@ -86,3 +86,10 @@ def test_values_that_are_not_finite_stay_out(device):
     image = film.radiance().reshape(-1, 3)
     np.testing.assert_array_equal(image[[5, 6]], 0.5)
     np.testing.assert_array_equal(image[7:], 1.0)
+
+
+def test_a_film_has_its_own_time():
+    """What a renderer spent on earlier films is not taken for what the filter of the next one will need."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=16, iterations=4, time_limit=100.0, light_paths=16))
+    renderer.launcher.profile.add("primary", 1000.0)
+    assert renderer.render().iterations == 4

@@ -114,6 +114,16 @@ def test_no_tree_is_built_for_what_only_moves(what, monkeypatch):
         assert renderer.scene.data.bvh.nodes is before.bvh.nodes
 
 
+def test_meshes_have_the_numbers_of_their_scene():
+    """A mesh without triangles moves nothing, but those after it, still or moving, have other numbers then."""
+    empty = ir.Mesh("empty", np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
+    renderer = ir.Renderer(scene(ROOM, ball(0.0)), SETTINGS)
+    moved = ball(1.0)
+    for frame in (scene(ROOM, moved), scene(empty, ROOM, moved), scene(ROOM, moved)):
+        renderer.update(frame)
+        np.testing.assert_array_equal(renderer.render().aov("prim_id"), ir.render(frame, SETTINGS).aov("prim_id"))
+
+
 def test_a_worn_tree_is_built_anew(monkeypatch):
     """Triangles that change places wear a tree; the frame in which they do costs a new one, the next does not."""
     points, triangles = sphere(level=4)

@@ -54,7 +54,7 @@ class Observations:
 class Picture:
     """What becomes of it all, and what it lacks on edges."""
 
-    rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; albedo and normal, if there are four
+    rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; if there are five, albedo, normal, plain mean
     rest: Layer  # plain mean less picture, and the variance of that by noise; -1: not on an edge
     iterations: int
     edge_rays: int
@@ -155,7 +155,7 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
         if weights <= 1.0e-6 and samples > 2.0:
             weights = samples
             around = firsts
-            spread = wp.max(squares - wp.cw_mul(firsts, firsts) / samples, wp.vec2(0.0))
+            spread = wp.max(squares, wp.cw_mul(firsts, firsts) / samples) - wp.cw_mul(firsts, firsts) / samples
         if weights > 1.0e-6:
             around = around / weights + wp.vec2(1.0e-30)
             scale = wp.cw_div(n * own + _AROUND * around, (n + _AROUND) * around)
@@ -519,7 +519,8 @@ class Reconstruction:
     def resolve(self, film: Any, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
         """Radiance by way of lights and of surfaces, from a `FilmData`: float32 [2, rows, columns, 3].
 
-        With `features` [4, ...]: albedo and normals, their edges as smooth as those of the picture, come after it.
+        With `features` [5, ...]: after it come albedo, normals, and the plain mean, all with edges as smooth as the
+        picture's.
         """
         launcher, pixels = self._launcher, self._pixels
         with launcher.phase("filter"):

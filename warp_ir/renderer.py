@@ -170,7 +170,7 @@ class Renderer:
         start = time.perf_counter() - film.seconds
         with _signals_cancel(self.launcher, film):
             checked, error = 0, math.nan
-            done = film.iterations
+            done, looked = film.iterations, self._primary_seconds()
             while not film.interrupted and film.iterations < self.settings.iteration_limit:
                 try:
                     self.add_iteration(film, film.iterations)
@@ -180,7 +180,9 @@ class Renderer:
                 # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
                 if film.iterations >= max(2, checked + checked // 8 + 1):
                     checked, error = film.iterations, film.error()
-                report = _progress(film, self.settings, error, self._filter_seconds(film, film.iterations - done))
+                looking = (self._primary_seconds() - looked) / (film.iterations - done)
+                reserve = 0.0 if film.reconstruction is None else looking * film.reconstruction.passes(film.iterations)
+                report = _progress(film, self.settings, error, reserve)
                 if progress is not None:
                     progress(report)
                 if report.fraction >= 1.0:
@@ -191,12 +193,9 @@ class Renderer:
         film.counts = {"iterations": film.iterations, **self.launcher.profile.counts}
         return film
 
-    def _filter_seconds(self, film: Film, iterations: int) -> float:
-        """What filtering will take [s], told by what camera rays have taken."""
-        if film.reconstruction is None:
-            return 0.0
-        camera_rays = self.launcher.profile.seconds().get("primary", 0.0) / iterations
-        return camera_rays * float(film.reconstruction.passes(film.iterations))
+    def _primary_seconds(self) -> float:
+        """What camera rays have taken so far [s]; it tells what filtering will take."""
+        return self.launcher.profile.seconds().get("primary", 0.0)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,9 @@ from tests.physics.test_light_control import (
     pixels,
     sky_texture,
 )
+from warp_ir.device_scene import upload_scene
 from warp_ir.estimators import ESTIMATORS
+from warp_ir.launch import Launcher
 from warp_ir.procedural import cube, floor, mesh, quad, sphere
 from warp_ir.scene import LightKind, Shaping
 
@@ -121,6 +123,20 @@ def test_the_eye_sees_the_shaping():
     scene = with_panel(ir.Scene(camera=ir.Camera.look_at(eye, (0, 0, 0), fov=0.01)), lamp)
     film = ir.render(scene, ir.RenderSettings(width=2, height=2, iterations=1))
     np.testing.assert_allclose(film.radiance(), 3.0 * math.cos(math.radians(30.0)) ** 3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_panel_may_be_dark_all_around(estimator):
+    """In a cone of 0° there is nothing: the picture is that of the other light, although rays hit the panel."""
+    bulb = ir.Light("bulb", LightKind.POINT, (2.0,) * 3, placed(DOWN, (0.5, 1.0, 0.0)))
+    dark = ir.Light(
+        "dark", LightKind.RECT, (3.0,) * 3, placed(DOWN, (0, 2, 0)), width=2, height=2, shaping=Shaping(cone_angle=0.0)
+    )
+    scene = dataclasses.replace(with_panel(floor(bulb), dark), lights=(bulb,))
+    uploaded = upload_scene(scene, Launcher("cpu"))
+    assert uploaded.data.emitter_count == 1 and uploaded.data.triangle_emitter.shape[0] == scene.triangle_count
+    film = render(scene, estimator, max_bounces=0, light_paths=64)
+    assert_mean(film, 2.0 / 1.25**1.5 / math.pi, bias=1.0e-3)
 
 
 @pytest.mark.parametrize("angle", [5.0, 40.0])

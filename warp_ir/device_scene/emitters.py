@@ -79,7 +79,8 @@ def upload_emitters(
     analytic = kind != _TRIANGLE_EMITTER
     light_emitter[item[analytic].astype(np.int64)] = emitter[analytic]
     data.light_emitter = launcher.array(light_emitter, wp.int32)
-    triangle_emitter = np.full(data.triangle_count if (~analytic).any() else 1, -1, np.int32)
+    # Whoever hits a material that emits looks here, even where shaping leaves no surface of it any power.
+    triangle_emitter = np.full(data.triangle_count if emission.any() else 1, -1, np.int32)
     triangle_emitter[item[~analytic].astype(np.int64)] = emitter[~analytic]
     data.triangle_emitter = launcher.array(triangle_emitter, wp.int32)
 

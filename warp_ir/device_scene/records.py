@@ -80,7 +80,7 @@ class SceneData:
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or _TRIANGLE_EMITTER
     emitter_density: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
-    triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no surface emits
+    triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no material emits
 
     light_count: int  # analytic lights
     light_kind: wp.array[wp.int32]

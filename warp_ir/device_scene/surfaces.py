@@ -170,11 +170,11 @@ class Surfaces:
         self._bvhs = self._trees.bring_together(worlds)
 
     def _numbers(self, layout: Layout) -> list[tuple[int, ...]]:
-        return [part.numbers for part in layout.head]
+        return [part.numbers for part in (*layout.head, *layout.tail)]
 
     def _number(self, layout: Layout) -> None:
-        """The numbers of meshes that stand still anew: others before them have come or gone."""
-        numbers = _numbered(layout.head)
+        """The numbers of all meshes anew: others before them have come or gone."""
+        numbers = _numbered([*layout.head, *layout.tail])
         if len(numbers):
             wp.copy(self._tables["triangle_mesh"].array, self._launcher.array(numbers, wp.int32))
 
@@ -225,17 +225,18 @@ class Surfaces:
 
     def _texture_table(self, textures: list[Texture]) -> Any:
         """The textures on the device."""
-        if self._textures is None or not _same(self._textures[0], textures):
+        if self._textures is None or not same_objects(self._textures[0], textures):
             self._textures = textures, upload_textures(textures, self._uv_sets, self._launcher)
         return self._textures[1]
 
 
-def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
+def same_objects(one: Sequence[Any], other: Sequence[Any]) -> bool:
+    """Whether two sequences hold the same objects."""
     return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
 
 
 def _same_meshes(one: Part, other: Part) -> bool:
-    return _same(one.meshes, other.meshes)
+    return same_objects(one.meshes, other.meshes)
 
 
 def _same_parts(one: Sequence[Part], other: Sequence[Part]) -> bool:

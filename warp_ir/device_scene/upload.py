@@ -15,7 +15,7 @@ from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
 from warp_ir.device_scene.lights import upload_lights
 from warp_ir.device_scene.records import SceneData
 from warp_ir.device_scene.storage import arranged
-from warp_ir.device_scene.surfaces import Surfaces
+from warp_ir.device_scene.surfaces import Surfaces, same_objects
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError, Scene, materials_of
 
@@ -102,9 +102,15 @@ def _upload(
     lower, upper = bounds
     extent = float(np.linalg.norm(upper - lower))
     stored = [arranged(scene) for scene in scenes]
-    lit = []
-    for scene in scenes:
+    lit: list[tuple[Any, Any, Any]] = []
+    for k, scene in enumerate(scenes):
         data = SceneData()
+        like = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
+        if like is not None:
+            for name in SceneData.vars:
+                setattr(data, name, getattr(lit[like][0], name))
+            lit.append((data, *lit[like][1:]))
+            continue
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
         # Links name meshes by their numbers in the scene, not by where they are stored.
@@ -153,14 +159,17 @@ def _max_albedo(scene: Scene) -> float:
 
 def _find(scene: Scene, others: Sequence[DeviceScene]) -> DeviceScene | None:
     """One of others that differs from a scene in its camera at most."""
-    return next((o for o in others if _same_surfaces(o.source, scene) and _same(o.source.lights, scene.lights)), None)
-
-
-def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+    lit = (o for o in others if same_objects(o.source.lights, scene.lights))
+    return next((o for o in lit if _same_surfaces(o.source, scene)), None)
 
 
 def _same_surfaces(one: Scene, other: Scene) -> bool:
     """Whether two scenes have the same meshes and instances, and equal materials."""
-    same = _same(one.meshes, other.meshes) and _same(one.instances, other.instances)
+    same = same_objects(one.meshes, other.meshes) and same_objects(one.instances, other.instances)
     return same and (one.materials is other.materials or one.materials == other.materials)
+
+
+def _same_lights(one: Scene, other: Scene) -> bool:
+    """Whether the tables of lights, and of meshes that are lights, are the same."""
+    lamps = [[(k, id(mesh)) for k, mesh in enumerate(s.meshes) if mesh.light is not None] for s in (one, other)]
+    return same_objects(one.lights, other.lights) and len(one.meshes) == len(other.meshes) and lamps[0] == lamps[1]

@@ -72,7 +72,7 @@ class Network:
             array = np.asarray(channels)
             if array.ndim > 1 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
                 what = "a finite colour" if array.shape == (3,) else "a finite number"
-                raise Unreadable(f"{attribute.GetName()} is {_short(channels)}, not {what}")
+                raise Unreadable(f"{attribute.GetName()} is {value.short(channels)}, not {what}")
             array = np.atleast_1d(array).astype(np.float64)
             if len(array) == 3 and value.is_color(attribute):
                 array = value.to_linear_rec709(attribute, array.reshape(1, 3))[0]
@@ -294,8 +294,3 @@ def _moved(x: float, y: float) -> Floats:
 def _rotation(degrees: float) -> Floats:
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _short(found: object) -> str:
-    words = " ".join(str(found).split())
-    return words if len(words) <= 40 else words[:37] + "…"

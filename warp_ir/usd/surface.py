@@ -1,4 +1,4 @@
-"""Surface shaders as the renderer's diffuse, emissive `Material`: UsdPreviewSurface and inline MaterialX.
+"""Surface shaders as the renderer's diffuse, emissive `Material`: UsdPreviewSurface and MaterialX.
 
 A metal, or the mirror part of a specular workflow, becomes a diffuse surface of the same hemispherical albedo.
 The few percent that a dielectric coating takes from the diffuse light below it are left out. Partial opacity lets

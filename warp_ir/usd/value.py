@@ -86,7 +86,7 @@ def number(attribute: Usd.Attribute, time: Usd.TimeCode, default: float) -> floa
     if value is None:
         return default
     if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
-        raise Unreadable(f"{attribute.GetName()} is {_short(value)}, not a finite number")
+        raise Unreadable(f"{attribute.GetName()} is {short(value)}, not a finite number")
     return float(value)  # type: ignore[arg-type]
 
 
@@ -113,7 +113,7 @@ def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color
         return default
     array = np.asarray(value)
     if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise Unreadable(f"{attribute.GetName()} is {_short(value)}, not a finite colour")
+        raise Unreadable(f"{attribute.GetName()} is {short(value)}, not a finite colour")
     red, green, blue = to_linear_rec709(attribute, array.astype(np.float64).reshape(1, 3))[0].tolist()
     return red, green, blue
 
@@ -156,6 +156,7 @@ def producer(shader_input: UsdShade.Input) -> Usd.Attribute | None:
     return attributes[0] if attributes else None
 
 
-def _short(value: object) -> str:
+def short(value: object) -> str:
+    """A value for a message of one line."""
     words = " ".join(str(value).split())
     return words if len(words) <= 40 else words[:37] + "…"
