@@ -155,7 +155,8 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
         if weights <= 1.0e-6 and samples > 2.0:
             weights = samples
             around = firsts
-            spread = wp.max(squares, wp.cw_mul(firsts, firsts) / samples) - wp.cw_mul(firsts, firsts) / samples
+            spread = squares - wp.cw_mul(firsts, firsts) / samples
+            spread = wp.max(spread, wp.vec2(0.0))
         if weights > 1.0e-6:
             around = around / weights + wp.vec2(1.0e-30)
             scale = wp.cw_div(n * own + _AROUND * around, (n + _AROUND) * around)
