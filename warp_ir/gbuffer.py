@@ -29,6 +29,7 @@ class GBuffer:
     position: wp.array[wp.vec3]  # off the (smooth) surface, where shadow rays start
     normal: wp.array[wp.vec3]  # geometric, or that of the smooth surface; light comes from its side alone
     shading_normal: wp.array[wp.vec3]
+    smooth_normal: wp.array[wp.vec3]  # the same without normal maps: by it surfaces are told apart
     albedo: wp.array[wp.vec3]
     emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection
     depth: wp.array[wp.float32]  # along the camera's -Z
@@ -79,6 +80,7 @@ class Sight:
     position: wp.vec3
     normal: wp.vec3
     shading_normal: wp.vec3
+    smooth_normal: wp.vec3
     albedo: wp.vec3
     emission: wp.vec3
     depth: float
@@ -129,7 +131,8 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
-        sight.shading_normal = mapped_normal(scene, hit, sight.shading_normal, pixel)
+        sight.smooth_normal = sight.shading_normal
+        sight.shading_normal = mapped_normal(scene, hit, sight.smooth_normal, pixel)
         sight.albedo = albedo(scene, hit, pixel)
         sight.emission = surface_seen(scene, hit, towards, pixel)
         reach = hit.t
@@ -167,18 +170,20 @@ def _trace_primary(
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
     gbuffer.normal[pixel] = sight.normal
-    gbuffer.shading_normal[pixel] = sight.shading_normal
+    gbuffer.smooth_normal[pixel] = sight.smooth_normal
+    gbuffer.shading_normal[pixel] = sight.shading_normal  # the same array, if there are no maps
     gbuffer.albedo[pixel] = sight.albedo
     gbuffer.emission[pixel] = sight.emission
     gbuffer.depth[pixel] = sight.depth
 
 
-def new_gbuffer(launcher: Launcher, pixels: int) -> Any:
-    """An uninitialised `GBuffer`."""
+def new_gbuffer(launcher: Launcher, pixels: int, mapped: bool) -> Any:
+    """An uninitialised `GBuffer`, of a scene with normal maps or without."""
     gbuffer = GBuffer()
     gbuffer.mesh = launcher.empty(pixels, wp.int32)
     for name in ("position", "normal", "shading_normal", "albedo", "emission"):
         setattr(gbuffer, name, launcher.empty(pixels, wp.vec3))
+    gbuffer.smooth_normal = launcher.empty(pixels, wp.vec3) if mapped else gbuffer.shading_normal
     gbuffer.depth = launcher.empty(pixels, wp.float32)
     return gbuffer
 

@@ -67,7 +67,7 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
     surfaces.footprint[p] = 0.0
     if gbuffer.mesh[p] >= 0:
         surfaces.position[p] = gbuffer.position[p]
-        surfaces.normal[p] = gbuffer.shading_normal[p]
+        surfaces.normal[p] = gbuffer.smooth_normal[p]
         size = camera.height / float(camera.image_rows)
         surfaces.footprint[p] = size * wp.where(camera.orthographic == 1, 1.0, gbuffer.depth[p])
 
@@ -100,12 +100,12 @@ def _observe(
         d = mean_channel(direct[p])
         i = mean_channel(indirect[p])
         if wp.isfinite(d) and wp.isfinite(i):
-            if same_surface(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]) > _MATCH:
+            if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > _MATCH:
                 seen.direct[p] += direct[p]
                 seen.indirect[p] += indirect[p]
                 seen.squares[p] += wp.vec2(d * d, i * i)
                 seen.count[p] += 1
-            elif not _shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.shading_normal[p]):
+            elif not _shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]):
                 seen.other_direct[p] += direct[p]
                 seen.other_indirect[p] += indirect[p]
                 seen.other_count[p] += 1
@@ -209,7 +209,7 @@ def _add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point
     out = lit
     direct = layer.direct[q]
     if direct[3] >= 0.0:
-        fit = same_surface(seen.surfaces, q, point.position, point.shading_normal)
+        fit = same_surface(seen.surfaces, q, point.position, point.smooth_normal)
         if fit > _MATCH:
             w = fit / (0.25 + wp.dot(away, away))
             out.direct += w * _color(direct)
@@ -320,7 +320,7 @@ def _look_closely(
         # Of one surface, the pixel needs no more rays: the edge lies in its neighbour.
         contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_emission)
         mixed = mixed or contrast > 0.0 or point.mesh < 0
-        mixed = mixed or same_surface(surfaces, p, point.position, point.shading_normal) < _MATCH
+        mixed = mixed or same_surface(surfaces, p, point.position, point.smooth_normal) < _MATCH
         out.rays += 1
         out.emission += point.emission
         out.albedo += point.albedo

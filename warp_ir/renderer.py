@@ -90,6 +90,7 @@ class Renderer:
         self.launcher.load(_modules(settings.estimator, self.launcher))
         self._moments: list[_Moment] = []
         self._gbuffer: Any = None
+        self._mapped = False
         self._take(scene)
 
     def update(self, scene: Scene) -> None:
@@ -118,8 +119,9 @@ class Renderer:
             estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
             self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
         pixels = camera.columns * camera.rows
-        if self._gbuffer is None or self._gbuffer.mesh.shape[0] != pixels:
-            self._gbuffer = new_gbuffer(launcher, pixels)
+        mapped = any(data.data.normal_map_count > 0 for data in uploaded)
+        if self._gbuffer is None or (self._gbuffer.mesh.shape[0], self._mapped) != (pixels, mapped):
+            self._gbuffer, self._mapped = new_gbuffer(launcher, pixels, mapped), mapped
             self._direct, self._indirect = launcher.empty(pixels, wp.vec3), launcher.empty(pixels, wp.vec3)
 
     def _check_memory(self) -> None:
