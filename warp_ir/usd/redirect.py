@@ -27,6 +27,8 @@ def with_documents(stage: Usd.Stage, report: Report) -> tuple[Sdf.Layer, ...]:
     Returns:
         Nothing where the stage can stay as it is. The layers must be held until the new stage is open.
     """
+    if not any(".mtlx" in str(error).lower() for error in stage.GetCompositionErrors()):
+        return ()  # looking for paths in a damaged layer could end the process
     used = [layer for layer in stage.GetUsedLayers() if layer]
     named = {layer: _dependencies(layer) for layer in used}
     wanted = {path for paths in named.values() for path in paths.values() if _is_mtlx(path)}
