@@ -86,6 +86,8 @@ def sample_emitter(scene: SceneData, choice: Choice, u: wp.vec2) -> LightPoint:
     else:
         out = _sample_point_or_direction(scene, item, choice.probability, u)
     out.emitter = choice.emitter
+    if only_sampled(scene, out.control):
+        out.density = 0.0
     return out
 
 
@@ -127,8 +129,6 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
         radiance = radiance * presence(scene, triangle, at_a, at_b)
     out.intensity = radiance / out.density
     out.control = control_of_surface(scene, triangle)
-    if only_sampled(scene, out.control):
-        out.density = 0.0
     return out
 
 
@@ -166,8 +166,6 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
     out.intensity = radiance / out.density
     out.control = control_of(scene, light)
-    if only_sampled(scene, out.control):
-        out.density = 0.0
     return out
 
 
@@ -176,9 +174,6 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
     kind = scene.light_kind[light]
     out = LightPoint()
     out.control = control_of(scene, light)
-    found = float(1.0)
-    if only_sampled(scene, out.control):
-        found = 0.0
     out.normal = wp.vec4(0.0, 0.0, 0.0, 1.0)
     if kind == _POINT:
         p = scene.light_origin[light]
@@ -195,7 +190,6 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
         out.density = probability * local[3]
         radiance = wp.cw_mul(scene.light_radiance[light], value_along(scene.light_tables[0].grids, texture, xyz))
         out.intensity = radiance / out.density
-        out.density *= found
         return out
     cone = float(2.0)
     if kind == _DISTANT:
@@ -205,7 +199,6 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
     if cone > 0.0:
         out.density = probability / (2.0 * wp.pi * cone)
         out.intensity = scene.light_radiance[light] / out.density
-        out.density *= found
     else:
         out.intensity = scene.light_radiance[light] / probability
     return out
