@@ -27,7 +27,7 @@ LAYERS = [
     ["lights"],
     ["gbuffer"],
     ["vpl", "film"],
-    ["gather", "filter"],
+    ["gather"],
     ["reconstruction"],
     ["image"],
     ["estimators"],

@@ -28,10 +28,11 @@ import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
 import warp_ir.film
-import warp_ir.filter
 import warp_ir.gather
 import warp_ir.gbuffer
-import warp_ir.reconstruction
+import warp_ir.reconstruction.compose
+import warp_ir.reconstruction.filter
+import warp_ir.reconstruction.observations
 import warp_ir.vpl
 from warp_ir.denoise import require_denoiser
 from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
@@ -270,12 +271,13 @@ def _modules(estimator: str, launcher: Launcher) -> list[Any]:
     common = [warp_ir.gbuffer, *([warp_ir.bvh.build] if launcher.device.is_cpu else []), warp_ir.film]
     if estimator == "vpl":
         return [
-            warp_ir.reconstruction,
+            warp_ir.reconstruction.compose,
             warp_ir.estimators.vpl,
             warp_ir.vpl,
             *common,
             warp_ir.gather,
-            warp_ir.filter,
+            warp_ir.reconstruction.observations,
+            warp_ir.reconstruction.filter,
         ]
     if estimator == "keller":
         return [warp_ir.vpl, warp_ir.estimators.keller, *common]

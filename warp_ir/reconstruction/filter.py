@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.launch import Launcher
+from warp_ir.reconstruction.surfaces import Surfaces, same_surface
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -20,18 +21,6 @@ _SIGMA = 7.0
 """Standard errors by which two estimates of one value may well differ, in the first pass ..."""
 _NARROW = 0.45
 """... and its factor from pass to pass: what is left then is smooth, and differences farther apart are real."""
-_PLANE = wp.constant(4.0)  # footprints off the plane at which a point belongs to another surface
-
-
-@wp.struct
-class Surfaces:
-    """What each pixel of an image stands for: the surface that is seen through its centre."""
-
-    columns: int
-    rows: int
-    position: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]  # unit
-    footprint: wp.array[wp.float32]  # size of a pixel there; 0: background
 
 
 @wp.struct
@@ -49,25 +38,15 @@ def mean_channel(v: wp.vec3) -> float:
 
 
 @wp.func
-def _window(x: float) -> float:
-    """A bell of width 1 (Tukey's biweight): no exponential in the inner loop."""
-    y = wp.max(1.0 - x, 0.0)
-    return y * y
+def mean_channels(direct: wp.vec3, indirect: wp.vec3) -> wp.vec2:
+    """The same of both parts."""
+    return wp.vec2(mean_channel(direct), mean_channel(indirect))
 
 
 @wp.func
-def same_surface(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
-    """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0."""
-    footprint = surfaces.footprint[p]
-    if footprint <= 0.0:
-        return 0.0
-    facing = wp.max(wp.dot(surfaces.normal[p], normal), 0.0)
-    facing *= facing
-    facing *= facing
-    facing *= facing
-    apart = position - surfaces.position[p]
-    off = wp.max(wp.abs(wp.dot(surfaces.normal[p], apart)), wp.abs(wp.dot(normal, apart)))
-    return facing * facing * _window(off / (_PLANE * footprint))
+def value(row: wp.vec4) -> wp.vec3:
+    """Irradiance over π of a row of a `Layer`, without its variance."""
+    return wp.vec3(row[0], row[1], row[2])
 
 
 @wp.func

@@ -1,0 +1,213 @@
+"""Samples of irradiance, by the surface that they fall on: their sums, their means, and how noisy those are."""
+
+from typing import Any
+
+import warp as wp
+
+from warp_ir.device_scene import CameraData, DeviceScene
+from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.launch import Launcher
+from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, new_layer
+from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+_PRIOR = wp.constant(8.0)  # samples of its own that outweigh what the neighbours say about a pixel's noise
+_AROUND = wp.constant(4.0)  # samples of its own that outweigh what the neighbours say about a pixel's brightness
+
+
+@wp.struct
+class Observations:
+    """Sums over the samples of irradiance over π that fell on each pixel's surface, and of those on no pixel's."""
+
+    surfaces: Surfaces
+    direct: wp.array[wp.vec3]
+    indirect: wp.array[wp.vec3]
+    squares: wp.array[wp.vec2]  # of the two mean channels
+    count: wp.array[wp.int32]
+    noise: wp.array[wp.vec2]  # variance of one sample of the two mean channels; worked out when the picture is made
+    other_direct: wp.array[wp.vec3]  # on surfaces that neither the pixel's centre shows nor a neighbour's
+    other_indirect: wp.array[wp.vec3]
+    other_count: wp.array[wp.int32]
+    seed: wp.uint32  # of the film
+
+
+@wp.kernel
+def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) -> None:
+    """Notes what is seen through the centre of each pixel."""
+    p = first + wp.tid()
+    surfaces.footprint[p] = 0.0
+    if gbuffer.mesh[p] >= 0:
+        surfaces.position[p] = gbuffer.position[p]
+        surfaces.normal[p] = gbuffer.smooth_normal[p]
+        size = camera.height / float(camera.image_rows)
+        surfaces.footprint[p] = size * wp.where(camera.orthographic == 1, 1.0, gbuffer.depth[p])
+
+
+@wp.kernel
+def _find_edges(first: int, surfaces: Surfaces, out: wp.array[wp.int32]) -> None:
+    """1 where any of the eight neighbours shows something else."""
+    p = first + wp.tid()
+    out[p] = 0
+    for k in range(9):
+        if differ(surfaces, p, pixel_around(surfaces, p, k)):
+            out[p] = 1
+
+
+@wp.kernel
+def _observe(
+    first: int,
+    gbuffer: GBuffer,
+    direct: wp.array[wp.vec3],
+    indirect: wp.array[wp.vec3],
+    seen: Observations,
+) -> None:
+    """Adds one iteration's sample of a pixel to those on its surface, or on none."""
+    p = first + wp.tid()
+    surfaces = seen.surfaces
+    if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
+        d = mean_channel(direct[p])
+        i = mean_channel(indirect[p])
+        if wp.isfinite(d) and wp.isfinite(i):
+            if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > MATCH:
+                seen.direct[p] += direct[p]
+                seen.indirect[p] += indirect[p]
+                seen.squares[p] += wp.vec2(d * d, i * i)
+                seen.count[p] += 1
+            elif not shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]):
+                seen.other_direct[p] += direct[p]
+                seen.other_indirect[p] += indirect[p]
+                seen.other_count[p] += 1
+
+
+@wp.kernel
+def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> None:
+    """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours.
+
+    While every pixel has one sample, the spread from pixel to pixel serves.
+    Of a few rays to many VPLs some arrive: the variance goes with the brightness, so that of the neighbours is scaled.
+    """
+    p = first + wp.tid()
+    row = p // surfaces.columns
+    column = p - row * surfaces.columns
+    spread = wp.vec2(0.0)
+    around = wp.vec2(0.0)
+    weights = float(0.0)
+    firsts = wp.vec2(0.0)
+    squares = wp.vec2(0.0)
+    samples = float(0.0)
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            x = column + 2 * dx
+            y = row + 2 * dy
+            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
+                q = y * surfaces.columns + x
+                if seen.count[q] > 0:
+                    w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
+                    sums = w * mean_channels(seen.direct[q], seen.indirect[q])
+                    w_free = w * float(seen.count[q] - 1)
+                    spread += w * _spread(seen, q)
+                    around += sums * (float(seen.count[q] - 1) / float(seen.count[q]))
+                    weights += w_free
+                    firsts += sums
+                    squares += w * seen.squares[q]
+                    samples += w * float(seen.count[q])
+    n = float(seen.count[p])
+    out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    if n > 0.0:
+        direct = seen.direct[p] / n
+        indirect = seen.indirect[p] / n
+        # Alone on its surface: as uncertain as it is bright.
+        own = mean_channels(direct, indirect)
+        variance = wp.cw_mul(own, own)
+        if weights <= 1.0e-6 and samples > 2.0:
+            weights = samples
+            around = firsts
+            spread = squares - wp.cw_mul(firsts, firsts) / samples
+            spread = wp.max(spread, wp.vec2(0.0))
+        if weights > 1.0e-6:
+            around = around / weights + wp.vec2(1.0e-30)
+            scale = wp.cw_div(n * own + _AROUND * around, (n + _AROUND) * around)
+            variance = (_PRIOR * wp.cw_mul(scale, spread / weights) + _spread(seen, p)) / (_PRIOR + n - 1.0)
+        seen.noise[p] = variance
+        out.direct[p] = wp.vec4(direct[0], direct[1], direct[2], variance[0] / n)
+        out.indirect[p] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1] / n)
+
+
+@wp.func
+def _spread(seen: Observations, q: int) -> wp.vec2:
+    """Sums of the squared deviations from the means."""
+    sums = mean_channels(seen.direct[q], seen.indirect[q])
+    return wp.max(seen.squares[q] - wp.cw_mul(sums, sums) / float(seen.count[q]), wp.vec2(0.0))
+
+
+@wp.kernel
+def _leave_out(first: int, seen: Observations, iterations: int, layer: Layer) -> None:
+    """Makes a background of the pixels in which an iteration has seen more than the surface in their centre."""
+    p = first + wp.tid()
+    if seen.count[p] != iterations:
+        seen.surfaces.footprint[p] = 0.0
+        layer.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+        layer.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+
+
+_NO_SUMS = ("surfaces", "noise", "seed")
+
+
+def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed: int) -> tuple[Any, float]:
+    """`Observations` without samples yet, and the share of the pixels that lie beside another surface.
+
+    `gbuffer` is used as scratch, `seed` is that of the film.
+    """
+    pixels = camera.columns * camera.rows
+    surfaces = Surfaces()
+    surfaces.columns, surfaces.rows = camera.columns, camera.rows
+    surfaces.position, surfaces.normal = launcher.zeros(pixels, wp.vec3), launcher.zeros(pixels, wp.vec3)
+    surfaces.footprint = launcher.empty(pixels, wp.float32)
+    trace_primary(scene, camera, launcher, gbuffer, iteration=-1, seed=0)
+    launcher.launch(_look, pixels, [camera, gbuffer, surfaces])
+    launcher.launch(_find_edges, pixels, [surfaces, gbuffer.mesh])
+    seen = Observations()
+    seen.surfaces = surfaces
+    for name in ("direct", "indirect", "other_direct", "other_indirect"):
+        setattr(seen, name, launcher.zeros(pixels, wp.vec3))
+    seen.squares, seen.noise = launcher.zeros(pixels, wp.vec2), launcher.zeros(pixels, wp.vec2)
+    seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
+    seen.seed = wp.uint32(seed)
+    return seen, float(gbuffer.mesh.numpy().mean())
+
+
+def sums(seen: Any) -> dict[str, Any]:
+    """The samples of `Observations`, by name."""
+    return {name: getattr(seen, name) for name in Observations.vars if name not in _NO_SUMS}
+
+
+def observe(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher) -> None:
+    """Adds one iteration's samples of irradiance over π to `Observations`."""
+    launcher.launch(_observe, gbuffer.mesh.shape[0], [gbuffer, direct, indirect, seen])
+
+
+def average(seen: Any, launcher: Launcher) -> Any:
+    """The means of `Observations` as a `Layer`; their noise is noted in it."""
+    pixels = seen.count.shape[0]
+    layer = new_layer(pixels, launcher)
+    launcher.launch(_average, pixels, [seen.surfaces, seen, layer])
+    return layer
+
+
+def without_mixed(seen: Any, layer: Any, iterations: int, launcher: Launcher) -> Any:
+    """The same `Observations`, where pixels that have seen more than the surface in their centre show none."""
+    seen = _copy(Observations, seen)
+    seen.surfaces = _copy(Surfaces, seen.surfaces)
+    seen.surfaces.footprint = wp.clone(seen.surfaces.footprint)
+    launcher.launch(_leave_out, seen.count.shape[0], [seen, iterations, layer])
+    return seen
+
+
+def _copy(kind: Any, record: Any) -> Any:
+    """Another record of some kind, of the same arrays."""
+    copy = kind()
+    for name in kind.vars:
+        setattr(copy, name, getattr(record, name))
+    return copy
