@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from warp_ir import InputError
-from warp_ir.tonemap import filmic, linear_from_srgb, srgb_from_linear, suggest_exposure, tone_map
+from warp_ir.tonemap import filmic, srgb_from_linear, suggest_exposure, tone_map
+from warp_ir.usd.color import srgb_to_linear
 
 
 def test_srgb_matches_the_standard():
     """IEC 61966-2-1: 0 and 1 stay, 0.5 encodes 0.2140411, and the two pieces meet at 0.0031308."""
     assert srgb_from_linear(np.array([0.0, 1.0])).tolist() == [0.0, pytest.approx(1.0, abs=1e-15)]
-    assert linear_from_srgb(np.array(0.5)) == pytest.approx(0.21404114, abs=1e-8)
+    assert srgb_to_linear(np.array(0.5)) == pytest.approx(0.21404114, abs=1e-8)
     # The standard's own constants leave a step of 3e-8 where the pieces meet.
     assert srgb_from_linear(np.array(0.0031308)) == pytest.approx(srgb_from_linear(np.array(0.0031309)), abs=2e-6)
 
@@ -18,13 +19,13 @@ def test_srgb_matches_the_standard():
 def test_srgb_round_trip():
     """Decoding undoes encoding: both are analytic, so only rounding (and the step of 3e-8) is left."""
     x = np.linspace(0.0, 1.0, 1001)
-    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(x)), x, atol=1e-7)
+    np.testing.assert_allclose(srgb_to_linear(srgb_from_linear(x)), x, atol=1e-7)
 
 
 def test_all_256_codes_survive():
     """An 8-bit picture that is read as linear and written again has the same bits."""
     codes = np.arange(256)
-    again = np.floor(srgb_from_linear(linear_from_srgb(codes / 255.0)) * 255.0 + 0.5)
+    again = np.floor(srgb_from_linear(srgb_to_linear(codes / 255.0)) * 255.0 + 0.5)
     assert (again == codes).all()
 
 

@@ -23,12 +23,6 @@ def srgb_from_linear(linear: Array) -> Array:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
 
-def linear_from_srgb(encoded: Array) -> Array:
-    """The inverse of `srgb_from_linear` on [0, 1]."""
-    x = np.clip(encoded, 0.0, 1.0)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
 def filmic(linear: Array) -> Array:
     """The curve that Narkowicz (2015, "ACES Filmic Tone Mapping Curve") fitted to the ACES reference.
 
