@@ -174,10 +174,13 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     launcher = Launcher(device)
     launcher.load([sys.modules[__name__]])
     uploaded = upload_scene(scene, launcher)
-    camera = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=width, height=width))
-    gbuffer = new_gbuffer(launcher, width * width)
+    settings = ir.RenderSettings(width=width, height=width)
+    camera = camera_data(scene.camera, uploaded.frame, settings)
+    gbuffer = new_gbuffer(launcher, width * width, uploaded.data.normal_map_count > 0)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
-    vpls = emit_vpls(uploaded, launcher, paths=PATHS, absorption="roulette", max_bounces=None, scramble=1)
+    vpls = emit_vpls(
+        uploaded, launcher, paths=PATHS, absorption="roulette", max_bounces=settings.bounce_limit, scramble=1
+    )
     try:
         embree = Embree(uploaded, launcher.threads) if device == "cpu" else None
     except ImportError:

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.bvh import _on_cuda
+from warp_ir.bvh import on_cuda
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
@@ -200,7 +200,7 @@ def _gather(
 ) -> wp.vec3:
     scene = scene_at(address)[0]
     chosen = chosen_set & (lit.sets - 1)
-    if _on_cuda():
+    if on_cuda():
         return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
     return _gather_in_blocks(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
 

@@ -260,7 +260,7 @@ def trace_vpls(
         launcher,
         paths=settings.path_count,
         absorption=settings.path_end,
-        max_bounces=settings.max_bounces,
+        max_bounces=settings.bounce_limit,
         scramble=iteration_scramble(settings.seed, iteration),
     )
     return to_host(vpls, uploaded)

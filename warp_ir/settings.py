@@ -13,6 +13,7 @@ ESTIMATOR_NAMES = ("vpl", "keller", "path")
 ABSORPTION_NAMES = ("roulette", "fractional")
 MAX_PIXELS = 1 << 28
 """Above this an image is refused on any machine; below, it depends on the memory there is."""
+_UNLIMITED = 2**31 - 1
 
 
 def _setting(default: Any, doc: str, choices: tuple[str, ...] = ()) -> Any:
@@ -113,6 +114,11 @@ class RenderSettings:
         if self.iterations is not None:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
+
+    @property
+    def bounce_limit(self) -> int:
+        """The longest chain of reflections, as kernels take it: unlimited is more than there can be."""
+        return _UNLIMITED if self.max_bounces is None else self.max_bounces
 
     @property
     def path_count(self) -> int:

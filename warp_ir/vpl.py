@@ -33,7 +33,6 @@ _MAX_REFLECTIVITY = 0.98
 # Dimensions 0-1: where on the light (the best pair), 2: which light, 3-4: direction, 5-6: place of a distant photon.
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
-_UNLIMITED = 2**31 - 1
 _FOLLOWED_AGAIN = 0.02
 """About the share of the paths that may be longer than what is noted of them."""
 _MOST_NOTED = 2**22
@@ -193,7 +192,7 @@ def emit_vpls(
     *,
     paths: int,
     absorption: str,
-    max_bounces: int | None,
+    max_bounces: int,
     scramble: int,
 ) -> Any:
     """Traces light paths and returns the `VplBuffer` of all their vertices; none if nothing emits.
@@ -205,7 +204,7 @@ def emit_vpls(
         launcher: Where to run.
         paths: Light paths to start.
         absorption: "fractional" or "roulette".
-        max_bounces: Longest chain of reflections; None: unlimited.
+        max_bounces: Longest chain of reflections.
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
     if not scene.emits:
@@ -213,7 +212,7 @@ def emit_vpls(
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
     settings.paths = paths
-    settings.max_bounces = _UNLIMITED if max_bounces is None else max_bounces
+    settings.max_bounces = max_bounces
     settings.survivors = launcher.kept("survivors", 1, wp.int32)
     if absorption == "fractional":
         alive = survivors(paths, scene.mean_albedo)

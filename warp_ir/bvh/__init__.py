@@ -9,7 +9,7 @@ hierarchy of the prototype, in whose space they go on.
 """
 
 from warp_ir.bvh.build import build_instance_tree
-from warp_ir.bvh.lanes import _on_cuda
+from warp_ir.bvh.lanes import on_cuda
 from warp_ir.bvh.layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
 from warp_ir.bvh.trees import Trees
 from warp_ir.bvh.walk import intersect, intersect_instances
@@ -21,8 +21,8 @@ __all__ = [
     "RayHit",
     "Trees",
     "TwoLevel",
-    "_on_cuda",
     "build_instance_tree",
     "intersect",
     "intersect_instances",
+    "on_cuda",
 ]

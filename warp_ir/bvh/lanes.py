@@ -20,7 +20,7 @@ _TINY = wp.constant(1.0e-18)
     return false;
 #endif
 """)
-def _on_cuda() -> bool:
+def on_cuda() -> bool:
     """Known at compile time: the other way costs nothing."""
     ...
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.bvh.lanes import _on_cuda, below, enter, first_lane, meet, meet_loosely, reciprocal
+from warp_ir.bvh.lanes import below, enter, first_lane, meet, meet_loosely, on_cuda, reciprocal
 from warp_ir.bvh.layout import Bvh, InstanceTree, RayHit, TwoLevel, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
@@ -175,7 +175,7 @@ def _hierarchy(name: str, loose: bool) -> Any:
         hit.triangle = -1
         hit.instance = -1
         hit.t = t_max
-        if _on_cuda():
+        if on_cuda():
             if any_hit:
                 if wp.mesh_query_ray_anyhit(mesh, origin, direction, t_max):
                     hit.triangle = 0
@@ -202,7 +202,7 @@ _through_prototype = _hierarchy("through_prototype", True)
 @wp.func
 def intersect(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool) -> RayHit:
     """The nearest triangle of the world along a ray before t_max; with `any_hit` some, without its coordinates."""
-    if _on_cuda():
+    if on_cuda():
         hit = RayHit()
         hit.triangle = -1
         hit.instance = -1
@@ -235,7 +235,7 @@ def _enter_instance(
     """The nearest triangle of one instance; the ray keeps its parameter t in the prototype's space."""
     instance = tree.instances[number]
     mesh = wp.uint64(0)
-    if _on_cuda():
+    if on_cuda():
         mesh = bvh.meshes[instance.root].mesh
     from_centre = origin - instance.centre
     o = instance.inverse * from_centre
@@ -318,7 +318,7 @@ def intersect_instances(
     hit.instance = -1
     hit.t = t_max
     number = int(0)
-    if _on_cuda():
+    if on_cuda():
         query = wp.bvh_query_ray(tree.bvh, origin, direction)
         while wp.bvh_query_next(query, number, hit.t):
             found = _enter_instance(bvh, tree, number, origin, direction, hit.t, any_hit)

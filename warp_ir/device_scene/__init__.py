@@ -5,12 +5,12 @@
 
 from warp_ir.device_scene.camera import CameraData, camera_data
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.records import _TRIANGLE_EMITTER, INSTANCE_COLOR, Patterns, SceneData
+from warp_ir.device_scene.records import INSTANCE_COLOR, TRIANGLE_EMITTER, Patterns, SceneData
 from warp_ir.device_scene.upload import DeviceScene, upload_moments, upload_scene
 
 __all__ = [
     "INSTANCE_COLOR",
-    "_TRIANGLE_EMITTER",
+    "TRIANGLE_EMITTER",
     "CameraData",
     "DeviceFrame",
     "DeviceScene",

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.materials import LARGEST_UV
-from warp_ir.device_scene.records import _TRIANGLE_EMITTER
+from warp_ir.device_scene.records import TRIANGLE_EMITTER
 from warp_ir.launch import Launcher
 from warp_ir.light_control import shaped_power
 from warp_ir.scene import Light, LightKind, Mesh, Scene
@@ -57,7 +57,7 @@ def upload_emitters(
             if mesh.light is not None:
                 normals = cross / np.maximum(length, 1.0e-30)[:, None]
                 power *= shaped_power(mesh.light, normals, double_sided=mesh.double_sided)
-            kinds.append(np.full(len(glowing), _TRIANGLE_EMITTER, np.int32))
+            kinds.append(np.full(len(glowing), TRIANGLE_EMITTER, np.int32))
             items.append((first + glowing).astype(np.int32))
             areas.append(sides * area)
             powers.append(power)
@@ -76,7 +76,7 @@ def upload_emitters(
 
     emitter = np.arange(len(power), dtype=np.int32)
     light_emitter = np.full(max(len(scene.lights), 1), -1, np.int32)
-    analytic = kind != _TRIANGLE_EMITTER
+    analytic = kind != TRIANGLE_EMITTER
     light_emitter[item[analytic].astype(np.int64)] = emitter[analytic]
     data.light_emitter = launcher.array(light_emitter, wp.int32)
     # Whoever hits a material that emits looks here, even where shaping leaves no surface of it any power.

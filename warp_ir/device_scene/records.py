@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 INSTANCE_COLOR = -2
 """In `SceneData.triangle_colors`: the triangle has the colour of its instance."""
-_TRIANGLE_EMITTER = len(LightKind)
+TRIANGLE_EMITTER = len(LightKind)
 """Kind of an emitter that is a triangle of an emissive mesh; the kinds below it are `LightKind`'s."""
 
 
@@ -77,7 +77,7 @@ class SceneData:
 
     emitter_count: int
     emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1
-    emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or _TRIANGLE_EMITTER
+    emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
     emitter_density: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
     triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no material emits

@@ -103,7 +103,7 @@ class Keller:
                 launcher,
                 paths=settings.path_count,
                 absorption=settings.path_end,
-                max_bounces=settings.max_bounces,
+                max_bounces=settings.bounce_limit,
                 scramble=iteration_scramble(settings.seed, iteration),
             )
         with launcher.phase("gather"):

@@ -23,7 +23,6 @@ from warp_ir.surface import albedo, closest
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _MAX_SURVIVAL = wp.constant(0.999)
-_UNLIMITED = 2**31 - 1
 
 
 @wp.func
@@ -137,7 +136,7 @@ class PathTracer:
                     self._camera,
                     gbuffer,
                     wp.uint32(sampling.iteration_scramble(settings.seed, iteration)),
-                    _UNLIMITED if settings.max_bounces is None else settings.max_bounces,
+                    settings.bounce_limit,
                     direct,
                     indirect,
                 ],

@@ -28,7 +28,6 @@ from warp_ir.vpl import emit_vpls
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_UNLIMITED = 2**31 - 1
 _SHADOW_RAYS = (4, 4)
 """Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
 _SHADOW_RAYS_AFTER = (2, 2)
@@ -171,7 +170,7 @@ class VplGatherer:
                 launcher,
                 paths=settings.path_count,
                 absorption=settings.path_end,
-                max_bounces=settings.max_bounces,
+                max_bounces=settings.bounce_limit,
                 scramble=scramble,
             )
             lights, surfaces = arrange(vpls, self._scene, launcher)
@@ -180,7 +179,7 @@ class VplGatherer:
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
         how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
-        how.max_bounces = _UNLIMITED if settings.max_bounces is None else settings.max_bounces
+        how.max_bounces = settings.bounce_limit
         with launcher.phase("gather"):
             launcher.launch(
                 _gather_pixels,

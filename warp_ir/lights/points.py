@@ -8,7 +8,7 @@ surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gat
 import warp as wp
 
 from warp_ir import sampling
-from warp_ir.device_scene import _TRIANGLE_EMITTER, SceneData
+from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
 from warp_ir.grid import cell_direction, cell_place, sample_cell, value_along, value_at_place
 from warp_ir.lights.arriving import only_sampled
 from warp_ir.lights.shape import (
@@ -31,7 +31,7 @@ _SPHERE = wp.constant(int(LightKind.SPHERE))
 _CYLINDER = wp.constant(int(LightKind.CYLINDER))
 _POINT = wp.constant(int(LightKind.POINT))
 _DISTANT = wp.constant(int(LightKind.DISTANT))
-_TRIANGLE = wp.constant(_TRIANGLE_EMITTER)
+_TRIANGLE = wp.constant(TRIANGLE_EMITTER)
 
 
 @wp.struct
