@@ -15,278 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from pxr import Usd, UsdGeom, UsdLux
+from scene_builder import Builder, rounded
+from shapes import BOX_FACES, boulder, box_points, chair, knot, unit_sphere, vase
+from textures import TEXTURES, linear_mean
 
 WHITE, GREY, DARK = (0.73, 0.72, 0.70), (0.5, 0.5, 0.5), (0.2, 0.2, 0.21)
-BOX_FACES = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-"""Faces -x +x -y +y -z +z of the corners that `_box_points` returns, counter-clockwise from outside."""
-
-
-def _rounded(values, digits=5):
-    """Python floats with few digits, and no minus zero."""
-    return (np.round(np.asarray(values, dtype=np.float64), digits) + 0.0).tolist()
-
-
-def _box_points(lower, upper):
-    """The eight corners, z fastest, float64 [8, 3]."""
-    return np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
-
-
-class Builder:
-    """A stage under construction, and the few verbs that the scenes need."""
-
-    def __init__(self, doc, meters_per_unit=1.0):
-        self.stage = Usd.Stage.CreateInMemory()
-        UsdGeom.SetStageUpAxis(self.stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(self.stage, meters_per_unit)
-        layer = self.stage.GetRootLayer()
-        layer.documentation = " ".join(doc.split())
-        layer.customLayerData = {"license": "CC0-1.0", "source": "scripts/make_scenes.py"}
-        self.stage.SetDefaultPrim(UsdGeom.Xform.Define(self.stage, "/World").GetPrim())
-
-    def material(self, name, albedo, emission=None, texture=None):
-        """A diffuse material; `texture` names a picture in `textures/`, `albedo` is then its mean."""
-        path = Sdf.Path("/World/Looks").AppendChild(name)
-        UsdGeom.Scope.Define(self.stage, path.GetParentPath())
-        material = UsdShade.Material.Define(self.stage, path)
-        surface = UsdShade.Shader.Define(self.stage, path.AppendChild("Surface"))
-        surface.CreateIdAttr("UsdPreviewSurface")
-        diffuse = surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-        if texture is None:
-            diffuse.Set(Gf.Vec3f(*albedo))
-        else:
-            diffuse.ConnectToSource(self._texture(path, texture, albedo))
-        if emission is not None:
-            surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*emission))
-        surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
-        surface.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
-        surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-        material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-        return material
-
-    def _texture(self, path, name, mean):
-        """UsdUVTexture of `textures/<name>.png` read at the primvar `st`; returns its rgb output."""
-        reader = UsdShade.Shader.Define(self.stage, path.AppendChild("St"))
-        reader.CreateIdAttr("UsdPrimvarReader_float2")
-        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-        texture = UsdShade.Shader.Define(self.stage, path.AppendChild("Texture"))
-        texture.CreateIdAttr("UsdUVTexture")
-        texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./textures/{name}.png")
-        texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-        texture.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("repeat")
-        texture.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("repeat")
-        texture.CreateInput("fallback", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*mean, 1.0))
-        st = texture.CreateInput("st", Sdf.ValueTypeNames.Float2)
-        st.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
-        return texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-
-    def bind(self, prim, material):
-        """Bind `material` to a prim and what lies below it."""
-        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
-
-    def mesh(self, path, points, faces, material=None, *, st=None, normals=None, digits=5):
-        """A polygon mesh under /World; `faces` are sequences of point indices."""
-        mesh = UsdGeom.Mesh.Define(self.stage, f"/World/{path}")
-        points = np.asarray(_rounded(points, digits))
-        mesh.CreatePointsAttr([Gf.Vec3f(*p) for p in points.tolist()])
-        mesh.CreateFaceVertexCountsAttr([len(face) for face in faces])
-        mesh.CreateFaceVertexIndicesAttr([int(i) for face in faces for i in face])
-        mesh.CreateExtentAttr([Gf.Vec3f(*points.min(axis=0)), Gf.Vec3f(*points.max(axis=0))])
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        if normals is not None:
-            mesh.CreateNormalsAttr([Gf.Vec3f(*n) for n in _rounded(normals, 3)])
-            mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        if st is not None:
-            primvars = UsdGeom.PrimvarsAPI(mesh)
-            primvar = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
-            primvar.Set([Gf.Vec2f(*uv) for uv in _rounded(st)])
-        if material is not None:
-            self.bind(mesh, material)
-        return mesh
-
-    def quad(self, path, corners, material, *, st=None):
-        """One rectangle; its front is the side from which the corners run counter-clockwise."""
-        return self.mesh(path, corners, [(0, 1, 2, 3)], material, st=st)
-
-    def box(self, path, lower, upper, material=None, *, inward=False, digits=5):
-        """An axis-aligned box of six faces that look outward, or `inward`."""
-        faces = BOX_FACES[:, ::-1] if inward else BOX_FACES
-        return self.mesh(path, _box_points(lower, upper), faces, material, digits=digits)
-
-    def room(self, lower, upper, **materials):
-        """Six inward faces, one mesh each; `materials` by left right floor ceiling back front, or `other`."""
-        points = _box_points(lower, upper)
-        names = ("left", "right", "floor", "ceiling", "back", "front")
-        for name, face in zip(names, BOX_FACES[:, ::-1], strict=True):
-            self.quad(f"Room/{name}", points[face], materials.get(name, materials.get("other")))
-
-    def place(self, prim, translate=(0, 0, 0), rotate=(0, 0, 0), scale=None):
-        """Author the transform: scale, then rotations about X, Y, Z [degrees], then the translation."""
-        xform = UsdGeom.Xformable(prim)
-        xform.AddTranslateOp().Set(Gf.Vec3d(*_rounded(translate)))
-        if any(rotate):
-            xform.AddRotateXYZOp().Set(Gf.Vec3f(*_rounded(rotate, 3)))
-        if scale is not None:
-            xform.AddScaleOp().Set(Gf.Vec3f(*_rounded(scale, 3)))
-        return prim
-
-    def aim(self, prim, position, target):
-        """Put a camera or light at `position`, its -Z towards `target`, +Y as upright as can be."""
-        x, y, z = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
-        pitch, yaw = math.degrees(math.asin(y)), math.degrees(math.atan2(-x, -z)) if abs(y) < 1 else 0.0
-        return self.place(prim, position, (pitch, yaw, 0.0))
-
-    def light(self, schema, name, color, intensity, **inputs):
-        """A UsdLux light; `inputs` by their names without the prefix `inputs:`."""
-        light = schema.Define(self.stage, f"/World/Lights/{name}")
-        light.CreateColorAttr(Gf.Vec3f(*_rounded(color, 3)))
-        light.CreateIntensityAttr(intensity)
-        for key, value in inputs.items():
-            light.GetPrim().GetAttribute(f"inputs:{key}").Set(value)
-        return light
-
-    def camera(
-        self,
-        position,
-        target,
-        *,
-        name="main_cam",
-        focal=24.0,
-        aperture=(24.0, 24.0),
-        shift=0.0,
-        clip=(0.01, 1000.0),
-    ):
-        """A pinhole camera; only the ratios of aperture and `shift` (upward) to focal length matter."""
-        camera = UsdGeom.Camera.Define(self.stage, f"/World/{name}")
-        camera.CreateFocalLengthAttr(focal)
-        camera.CreateHorizontalApertureAttr(aperture[0])
-        camera.CreateVerticalApertureAttr(aperture[1])
-        if shift:
-            camera.CreateVerticalApertureOffsetAttr(shift)
-        camera.CreateClippingRangeAttr(Gf.Vec2f(*clip))
-        return self.aim(camera, position, target)
-
-
-# Shapes: points float64 [n, 3] and faces.
-
-
-def _grid_faces(rows, columns, wrap_rows=False):
-    """Quads of a grid of points [rows, columns] whose columns close up (and rows, if `wrap_rows`)."""
-    i = np.arange(rows if wrap_rows else rows - 1)[:, None]
-    j = np.arange(columns)[None, :]
-    index = [((i + a) % rows) * columns + (j + b) % columns for a, b in ((0, 0), (0, 1), (1, 1), (1, 0))]
-    return np.stack(index, axis=-1).reshape(-1, 4)
-
-
-def _unit_sphere(rows, columns):
-    """A closed sphere with poles on the Y axis: directions, and faces that look outward."""
-    theta = np.pi * np.arange(1, rows) / rows
-    phi = 2.0 * np.pi * np.arange(columns) / columns
-    ring = np.stack([np.cos(phi), np.zeros(columns), -np.sin(phi)], axis=-1)
-    rings = np.sin(theta)[:, None, None] * ring + np.cos(theta)[:, None, None] * (0.0, 1.0, 0.0)
-    points = np.concatenate([rings.reshape(-1, 3), [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]])
-    top, last = len(points) - 2, (rows - 2) * columns
-    faces = [tuple(face) for face in _grid_faces(rows - 1, columns)[:, ::-1].tolist()]
-    for j in range(columns):
-        k = (j + 1) % columns
-        faces += [(top, j, k), (top + 1, last + k, last + j)]
-    return points, faces
-
-
-def _boulder(rows=18, columns=36):
-    """A lumpy sphere that stands on y = 0."""
-    points, faces = _unit_sphere(rows, columns)
-    x, y, z = points.T
-    bumps = np.sin(5 * x + 1) * np.sin(4 * y + 2) * np.sin(6 * z) + 0.5 * np.sin(11 * x) * np.sin(9 * y + 1)
-    points = points * (1.0 + 0.16 * bumps)[:, None] * (0.28, 0.24, 0.28)
-    return points - (0.0, points[:, 1].min(), 0.0), faces
-
-
-def _vase(rows=20, columns=40):
-    """A fluted vase on y = 0: closed below, and above by its own narrow neck."""
-    points, faces = _unit_sphere(rows, columns)
-    height = 0.5 - 0.5 * points[:, 1]
-    angle = np.arctan2(points[:, 2], points[:, 0])
-    radius = 0.16 + 0.07 * np.sin(2 * np.pi * (height * 1.1 + 0.45)) + 0.008 * np.cos(10 * angle + 6 * height)
-    rim = np.hypot(points[:, 0], points[:, 2]) > 1e-9
-    points = np.stack([rim * radius * np.cos(angle), 0.62 * (1.0 - height), rim * radius * np.sin(angle)], axis=-1)
-    return points, faces
-
-
-def _knot(rows=96, columns=9, tube=0.075):
-    """A trefoil knot that stands on y = 0: points, faces and smooth normals."""
-    t = 2.0 * np.pi * np.arange(rows) / rows
-
-    def curve(t):
-        ring = 2.0 + np.cos(3 * t)
-        return 0.11 * np.stack([ring * np.cos(2 * t), ring * np.sin(2 * t), 1.5 * np.sin(3 * t)], axis=-1)
-
-    tangent = curve(t + 1e-4) - curve(t - 1e-4)
-    side = np.cross(tangent, (0.0, 0.0, 1.0))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    up = np.cross(side, tangent)
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    phi = 2.0 * np.pi * np.arange(columns) / columns
-    normals = np.cos(phi)[None, :, None] * side[:, None] + np.sin(phi)[None, :, None] * up[:, None]
-    points = (curve(t)[:, None] + tube * normals).reshape(-1, 3)
-    return points - (0.0, points[:, 1].min(), 0.0), _grid_faces(rows, columns, True)[:, ::-1], normals.reshape(-1, 3)
-
-
-def _chair():
-    """A chair of six boxes on y = 0 that looks along +z."""
-    parts = [((-0.2, 0.42, -0.2), (0.2, 0.46, 0.2)), ((-0.2, 0.6, -0.2), (0.2, 0.95, -0.16))]
-    parts += [((x, 0.0, z), (x + 0.04, 0.42 if z > 0 else 0.6, z + 0.04)) for x in (-0.2, 0.16) for z in (-0.2, 0.16)]
-    points = np.concatenate([_box_points(*part) for part in parts])
-    return points, np.concatenate([BOX_FACES + 8 * k for k in range(len(parts))])
-
-
-# Textures: linear-light means, and sRGB pixels uint8 [256, 256, 3], row 0 at the top.
-
-
-def _planks():
-    """Eight floor boards with grain along u."""
-    stream = np.random.default_rng(1)
-    grain = np.repeat(stream.random((128, 8)), 32, axis=1) * 0.14
-    tone = np.repeat(stream.random(8), 16) * 0.25
-    value = np.repeat(0.66 + tone[:, None] + grain, 2, axis=0)
-    value[np.arange(256) % 32 < 1] *= 0.45
-    for board, cut in enumerate((stream.random(8) * 256).astype(int)):
-        value[board * 32 : board * 32 + 32, cut] *= 0.45
-    return np.clip(value[..., None] * (176, 142, 108), 0, 255).astype(np.uint8)
-
-
-def _bricks():
-    """Eight courses of bricks, every second one shifted by half a brick."""
-    stream = np.random.default_rng(2)
-    y, x = np.mgrid[:256, :256]
-    course = y // 32
-    shifted = (x + 32 * (course % 2)) % 256
-    tone = (0.8 + 0.35 * stream.random((8, 4)))[course, shifted // 64]
-    mortar = (y % 32 < 3) | (shifted % 64 < 3)
-    return np.where(mortar[..., None], (150, 140, 130), tone[..., None] * (205, 170, 148)).astype(np.uint8)
-
-
-def _rug():
-    """A rug: concentric diamonds in four colours, a border, plain threads."""
-    y, x = np.mgrid[:256, :256]
-    colours = np.array([(150, 44, 48), (222, 190, 130), (36, 62, 104), (206, 120, 62)])
-    pattern = colours[((np.abs(x % 128 - 63) + np.abs(y % 128 - 63)) // 16) % 4]
-    edge = np.minimum(np.minimum(x, 255 - x), np.minimum(y, 255 - y))
-    pattern = np.where(edge[..., None] < 20, np.where(edge[..., None] < 8, colours[1], colours[2]), pattern)
-    return (pattern * (1.0 - 0.08 * ((x + y) % 2))[..., None]).astype(np.uint8)
-
-
-TEXTURES = {"planks": _planks, "bricks": _bricks, "rug": _rug}
-
-
-def _linear_mean(pixels):
-    """Mean of the linear values of sRGB pixels, to three digits."""
-    value = pixels / 255.0
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return _rounded(linear.mean(axis=(0, 1)), 3)
-
-
-# The scenes.
 
 
 def cornell_box():
@@ -324,7 +58,7 @@ def cornell_box():
 def furnace_sphere():
     """A closed sphere of albedo 1/2 that emits 1, seen from inside: every pixel is 1 / (1 - 1/2) = 2."""
     scene = Builder(furnace_sphere.__doc__)
-    points, faces = _unit_sphere(64, 128)
+    points, faces = unit_sphere(64, 128)
     glowing = scene.material("Glowing", GREY, emission=(1.0, 1.0, 1.0))
     scene.mesh("Sphere", points, [face[::-1] for face in faces], glowing)
     scene.camera((0.2, 0.1, 0.3), (-1.0, 0.0, -0.5), focal=15.0)
@@ -393,10 +127,10 @@ def crowded_room():
         left=scene.material("Teal", (0.22, 0.45, 0.45)),
     )
     palette = [
-        scene.material(f"Paint_{k}", _rounded(colorsys.hsv_to_rgb(k / 9, 0.35 + 0.4 * (k % 3) / 2, 0.75), 3))
+        scene.material(f"Paint_{k}", rounded(colorsys.hsv_to_rgb(k / 9, 0.35 + 0.4 * (k % 3) / 2, 0.75), 3))
         for k in range(9)
     ]
-    shapes = {"boulder": _boulder(), "vase": _vase(), "knot": _knot()[:2], "chair": _chair()}
+    shapes = {"boulder": boulder(), "vase": vase(), "knot": knot()[:2], "chair": chair()}
     scene.stage.CreateClassPrim("/World/Prototypes")
     for name, (points, faces) in shapes.items():
         scene.stage.DefinePrim(f"/World/Prototypes/{name}", "Xform")
@@ -441,7 +175,7 @@ def thousand_lights():
     stone = scene.material("Stone", (0.6, 0.58, 0.55))
     for k, (x, z, height) in enumerate([(-1.6, -1.4, 1.6), (0.1, -1.9, 2.1), (1.7, -1.2, 1.2), (0.9, 0.4, 0.5)]):
         scene.box(f"Columns/column_{k}", (x - 0.3, 0, z - 0.3), (x + 0.3, height, z + 0.3), stone)
-    scene.mesh("Boulder", 2.0 * _boulder()[0] + (-0.9, 0, 0.2), _boulder()[1], stone, digits=3)
+    scene.mesh("Boulder", 2.0 * boulder()[0] + (-0.9, 0, 0.2), boulder()[1], stone, digits=3)
     for k in range(1000):
         strand, along = k % 10, (k // 10 + 0.5) / 100
         angle = 2 * math.pi * (along + strand / 10)
@@ -473,7 +207,7 @@ def thin_walls():
         lower, upper = np.full(3, -1.1), np.full(3, 1.1)
         lower[axis] = upper[axis] = -1.0
         face = BOX_FACES[2 * axis]
-        scene.quad(f"DarkBox/sheet{axes[axis]}", _box_points(lower, upper)[face], white)
+        scene.quad(f"DarkBox/sheet{axes[axis]}", box_points(lower, upper)[face], white)
         lower[axis], upper[axis] = 1.0, 1.000002
         scene.box(f"DarkBox/slab{axes[axis]}", lower, upper, white, digits=6)
     for axis in range(3):
@@ -516,7 +250,7 @@ def light_types():
         scene.box(f"Cabinet/{name}", lower, upper, white)
     centres = (-2.075, 0.0, 2.075)
     for k in range(6):
-        colour = scene.material(f"Block_{k}", _rounded(colorsys.hsv_to_rgb(k / 6, 0.5, 0.75), 3))
+        colour = scene.material(f"Block_{k}", rounded(colorsys.hsv_to_rgb(k / 6, 0.5, 0.75), 3))
         block = scene.box(f"Blocks/block_{k}", (-0.3, 0, -0.3), (0.3, 0.7, 0.3), colour)
         scene.place(block, (centres[k % 3], 2.1 * (k // 3), -1.1), (0, 30, 0))
     warm = (1.0, 0.88, 0.7)
@@ -538,12 +272,12 @@ def light_types():
 def two_rooms():
     """Two textured rooms and a doorway: the lamp is in the far room, the camera in the near one."""
     scene = Builder(two_rooms.__doc__)
-    means = {name: _linear_mean(make()) for name, make in TEXTURES.items()}
+    means = {name: rounded(linear_mean(make()), 3) for name, make in TEXTURES.items()}
     planks, bricks, rug = (scene.material(k.capitalize(), means[k], texture=k) for k in TEXTURES)
     plaster, wood = scene.material("Plaster", (0.75, 0.72, 0.66)), scene.material("Wood", (0.35, 0.22, 0.13))
     blue = scene.material("Blue", (0.2, 0.32, 0.5))
     lower, upper = np.array((-4.0, 0.0, -2.0)), np.array((4.0, 2.6, 2.0))
-    points = _box_points(lower, upper)
+    points = box_points(lower, upper)
     names = ("left", "right", "floor", "ceiling", "back", "front")
     textured = {"floor": (planks, (0, 2), 2.0), "right": (bricks, (2, 1), 2.0), "back": (bricks, (0, 1), 2.0)}
     for name, face in zip(names, BOX_FACES[:, ::-1], strict=True):
@@ -561,7 +295,7 @@ def two_rooms():
     scene.box("Table/top", (-2.3, 0.42, -0.55), (-1.3, 0.47, 0.05), wood)
     for k, (x, z) in enumerate([(-2.25, -0.5), (-1.4, -0.5), (-2.25, -0.05), (-1.4, -0.05)]):
         scene.box(f"Table/leg_{k}", (x, 0.01, z), (x + 0.05, 0.42, z + 0.05), wood)
-    scene.mesh("Vase", 0.7 * _vase()[0] + (-1.8, 0.47, -0.25), _vase()[1], blue, digits=3)
+    scene.mesh("Vase", 0.7 * vase()[0] + (-1.8, 0.47, -0.25), vase()[1], blue, digits=3)
     scene.box("Cabinet", (-2.6, 0, -1.98), (-1.0, 1.0, -1.55), wood)
     scene.box("Sofa/seat", (2.2, 0, -1.6), (3.6, 0.45, 0.4), blue)
     scene.box("Sofa/back", (3.6, 0, -1.6), (3.85, 0.95, 0.4), blue)
@@ -596,11 +330,11 @@ def turntable():
     rim = [(k, (k + 1) % 64, (k + 1) % 64 + 64, k + 64) for k in range(64)]
     slate = scene.material("Slate", DARK)
     scene.mesh("Turntable/Disc", disc, [*rim, tuple(range(64, 128)), tuple(range(63, -1, -1))], slate)
-    points, faces, normals = _knot(rows=192, columns=24, tube=0.07)
-    knot = scene.mesh("Turntable/Knot", points, faces, clay, normals=normals, digits=4)
-    scene.place(knot, (0, 0.1, 0))
+    points, faces, normals = knot(rows=192, columns=24, tube=0.07)
+    trefoil = scene.mesh("Turntable/Knot", points, faces, clay, normals=normals, digits=4)
+    scene.place(trefoil, (0, 0.1, 0))
     for k, hue in enumerate((0.1, 0.35, 0.6, 0.85)):
-        colour = scene.material(f"Block_{k}", _rounded(colorsys.hsv_to_rgb(hue, 0.6, 0.7), 3))
+        colour = scene.material(f"Block_{k}", rounded(colorsys.hsv_to_rgb(hue, 0.6, 0.7), 3))
         block = scene.box(f"Turntable/block_{k}", (-0.1, 0, -0.1), (0.1, 0.2 + 0.08 * k, 0.1), colour)
         angle = math.pi * (k + 0.5) / 2
         scene.place(block, (0.62 * math.cos(angle), 0.1, 0.62 * math.sin(angle)), (0, 25 * k, 0))

@@ -1,6 +1,7 @@
 """The committed test scenes and reference pictures are what their scripts say they are."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ def _script(path):
     return module
 
 
+sys.path.insert(0, str(ROOT / "scripts"))  # where Python finds what a script imports
 make_scenes = _script(ROOT / "scripts" / "make_scenes.py")
 make_references = _script(ROOT / "benchmarks" / "make_references.py")
 NAMES = [make.__name__ for make in make_scenes.SCENES]
