@@ -93,3 +93,21 @@ def test_a_film_has_its_own_time():
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=16, iterations=4, time_limit=100.0, light_paths=16))
     renderer.launcher.profile.add("primary", 1000.0)
     assert renderer.render().iterations == 4
+
+
+def test_cancelled_films_hold_whole_iterations(monkeypatch):
+    """`cancel` while an iteration is being added waits until it is: no pixel has it without the others."""
+    settings = ir.RenderSettings(width=32, height=32, light_paths=64)
+    films = []
+    for cancels in (False, True):
+        renderer = Renderer(cornell_box(), settings)
+        film = renderer.new_film()
+        renderer.add_iteration(film, 0)
+        if cancels:
+            add = film.add
+            monkeypatch.setattr(film, "add", lambda *rows, add=add, r=renderer: (r.launcher.cancel(), add(*rows)))
+        renderer.add_iteration(film, 1)
+        renderer.launcher.resume()
+        films.append(film)
+    assert films[1].iterations == 2
+    np.testing.assert_array_equal(films[0].radiance(), films[1].radiance())

@@ -36,6 +36,66 @@ def test_cancel_abandons():
     assert out.numpy().max() == 0
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_beside_is_done_when_its_block_ends(threads):
+    """Launches beside a block and those in it all run, every index once, however often they meet."""
+    launcher = Launcher("cpu", threads)
+    beside, inside = launcher.zeros(5000, wp.int32), launcher.zeros(5000, wp.int32)
+    for count in (1, 300, 5000, 5000, 5000):  # bands are cut by what earlier launches have taken
+        beside.zero_(), inside.zero_()
+        with launcher.beside("beside", lambda count=count: launcher.launch(_square, count, [beside])):
+            for begin in (0, count // 2):
+                part = count // 2 if begin == 0 else count - begin
+                launcher.launch(_square, part, [inside[begin:]])
+        expected = np.arange(count, dtype=np.int32) ** 2
+        np.testing.assert_array_equal(beside.numpy()[:count], expected)
+        np.testing.assert_array_equal(inside.numpy()[: count // 2], expected[: count // 2])
+        np.testing.assert_array_equal(inside.numpy()[count // 2 : count], expected[: count - count // 2])
+    assert launcher.profile.seconds()["beside"] > 0.0
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_is_beside_ends_with_its_block(threads):
+    """An error in the block, or `cancel`, leaves no launch behind that would go on writing."""
+    launcher = Launcher("cpu", threads)
+    out = launcher.zeros(100_000, wp.int32)
+
+    def start():
+        launcher.launch(_square, 100_000, [out])
+
+    with pytest.raises(ZeroDivisionError), launcher.beside("beside", start):
+        raise ZeroDivisionError
+    np.testing.assert_array_equal(out.numpy()[:1000], np.arange(1000, dtype=np.int32) ** 2)
+    with pytest.raises(Cancelled), launcher.beside("beside", start):
+        launcher.cancel()
+    out.zero_()
+    launcher.resume()
+    launcher.launch(_square, 1, [launcher.zeros(1, wp.int32)])
+    assert out.numpy().max() == 0
+
+
+def test_undisturbed_runs_to_its_end():
+    """What must be done entirely or not at all is done in spite of `cancel`, which takes effect after it."""
+    launcher = Launcher("cpu", 2)
+    out = launcher.zeros(1000, wp.int32)
+    launcher.cancel()
+    with launcher.undisturbed():
+        launcher.launch(_square, 1000, [out])
+    np.testing.assert_array_equal(out.numpy(), np.arange(1000, dtype=np.int32) ** 2)
+    with pytest.raises(Cancelled):
+        launcher.launch(_square, 1000, [out])
+
+
+def test_errors_of_a_launch_are_raised():
+    """A launch that cannot be packed raises where it is made, and leaves the launcher as it was."""
+    launcher = Launcher("cpu", 2)
+    out = launcher.zeros(1000, wp.int32)
+    with pytest.raises(RuntimeError, match="expects an array"):
+        launcher.launch(_square, 1000, [3.0])
+    launcher.launch(_square, 1000, [out])
+    np.testing.assert_array_equal(out.numpy(), np.arange(1000, dtype=np.int32) ** 2)
+
+
 def test_kept_arrays_stay():
     """A name gives the same array until it needs more rows, and other names give others."""
     launcher = Launcher("cpu", 1)

@@ -4,15 +4,17 @@ A Warp launch on the CPU is single-threaded but releases the GIL, so a launch is
 indices that Python threads take in turn. The convention that makes this possible: the first argument
 of every kernel of this package is ``first: int``, and its index is ``first + wp.tid()``. Kernels write
 only what their index owns, so the cut cannot be seen in the result.
+
+What is short, or done on the host, keeps one thread busy: `Launcher.beside` gives the others something to do.
 """
 
 import math
 import os
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import Any
 
 import warp as wp
@@ -20,7 +22,12 @@ import warp as wp
 from warp_ir.profiling import Profile
 from warp_ir.scene import InputError
 
-_BANDS_PER_THREAD = 16
+_MOST_OF_A_LAUNCH = 16
+"""No band is a larger part of a launch than this, so that Ctrl-C need not wait for long."""
+_MOST_BANDS = 64
+"""Per thread."""
+_LEAST_SECONDS = 1.0e-4
+"""What a band should take at least: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
 
 
@@ -28,8 +35,23 @@ class Cancelled(Exception):
     """The work in flight was abandoned because `Launcher.cancel` was called."""
 
 
+class _Work:
+    """A launch under way on the CPU. What changes does so under the launcher's lock."""
+
+    def __init__(self, kernel: Any, count: int, inputs: Sequence[Any], phase: str | None, whole: bool) -> None:
+        self.kernel, self.count, self.inputs = kernel, count, inputs
+        self.phase = phase  # which its seconds go to; None: that of the thread that waits for it
+        self.whole = whole  # cancelling does not touch it
+        self.least = 1  # indices of a band
+        self.taken = 0
+        self.run = 0
+        self.commands: list[Any] = []  # recorded launches that no thread is using
+        self.done = threading.Event()
+        self.error: BaseException | None = None
+
+
 class Launcher:
-    """Runs kernels on one device, and measures them by phase."""
+    """Runs kernels on one device, and measures them by phase. One thread may use it; it uses others itself."""
 
     def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
         """Opens the device.
@@ -48,7 +70,14 @@ class Launcher:
             raise InputError(f"device {device!r} is not available; available: {known}") from error
         self.profile = Profile(self.device)
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
-        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+        self._lock = threading.Lock()
+        self._open: list[_Work] = []  # the latest is the most urgent
+        self._helpers = 0  # threads of the pool that look for bands
+        self._pace: dict[Any, float] = {}  # seconds per index of a kernel, as last seen
+        self._phase: str | None = None  # the one being timed
+        self._beside: str | None = None  # phase of the launches that nobody waits for
+        self._whole = False
         self._cancelled = threading.Event()
         self._kept: dict[str, Any] = {}
 
@@ -73,36 +102,130 @@ class Launcher:
         Raises:
             Cancelled: `cancel` was called before all of it had run.
         """
-        if self._cancelled.is_set():
+        if self._cancelled.is_set() and not self._whole:
             raise Cancelled
         if count <= 0:
             return
         if self.device.is_cuda:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
-        bands = min(count, self.threads * _BANDS_PER_THREAD)
-        edges = [count * k // bands for k in range(bands + 1)]
-        spans = iter(list(pairwise(edges)))
-        # Packing the arguments costs more than a band may take: once per thread, not once per band.
-        workers = self.threads if count >= 256 else 1
-        commands = [
-            wp.launch(kernel, dim=1, inputs=[0, *inputs], device=self.device, record_cmd=True) for _ in range(workers)
-        ]
-        if self._pool is None or workers == 1:
-            self._work(commands[0], spans)
-        else:
-            list(self._pool.map(lambda command: self._work(command, spans), commands))
-        if self._cancelled.is_set():
+        work = _Work(kernel, count, inputs, self._beside, self._whole)
+        work.commands.append(self._record(work))  # here, where the module is loaded if it has not been
+        pace = self._pace.get(kernel)
+        even = count // (_MOST_OF_A_LAUNCH * self.threads)
+        work.least = max(count // (_MOST_BANDS * self.threads), even if pace is None else int(_LEAST_SECONDS / pace), 1)
+        with self._lock:
+            self._open.append(work)
+            wanted = min(self.threads - 1 - self._helpers, -(-count // work.least) - (self._beside is None))
+            self._helpers += max(wanted, 0)
+        for _ in range(wanted):
+            self._pool.submit(self._help)  # type: ignore[union-attr]
+        if self._beside is None:
+            self._finish([work])
+
+    @contextmanager
+    def beside(self, phase: str, start: Callable[[], None]) -> Iterator[None]:
+        """What `start` launches is run by whoever is free while the block runs, and done when the block ends.
+
+        Its launches must not depend on each other nor on what the block does, nor the other way round. On CUDA they
+        just come first. Their time goes to `phase`, and not to the phases in the block.
+        """
+        if self.device.is_cuda:
+            with self.phase(phase):
+                start()
+            yield
+            return
+        mark = len(self._open)
+        try:
+            self._beside = phase
+            try:
+                start()
+            finally:
+                self._beside = None
+            yield
+        finally:
+            self._finish(self._open[mark:])
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """`cancel` does not touch the launches inside: for what must be done entirely or not at all."""
+        self._whole = True
+        try:
+            yield
+        finally:
+            self._whole = False
+
+    def _record(self, work: _Work) -> Any:
+        return wp.launch(work.kernel, dim=1, inputs=[0, *work.inputs], device=self.device, record_cmd=True)
+
+    def _finish(self, works: Sequence[_Work]) -> None:
+        """Helps until some launches are done."""
+        try:
+            for work in works:
+                while band := self._take(work):
+                    self._run(*band)
+                while not work.done.is_set():  # another thread is at it: there may be something else to do
+                    if band := self._take():
+                        self._run(*band)
+                    else:
+                        work.done.wait()
+        finally:
+            with self._lock:
+                self._open = [work for work in self._open if work not in works]
+        for work in works:
+            if work.error is not None:
+                raise work.error
+        if self._cancelled.is_set() and not all(work.whole for work in works):
             raise Cancelled
 
-    def _work(self, command: Any, spans: Iterator[tuple[int, int]]) -> None:
-        """Runs bands from the common list until none is left; taking one is atomic, since it holds the GIL."""
-        for begin, end in spans:
-            if self._cancelled.is_set():
-                return
-            command.set_param_at_index(0, begin)
-            command.set_dim(end - begin)
-            command.launch()
+    def _help(self) -> None:
+        """Runs bands of whatever is open, in a thread of the pool."""
+        while band := self._take(helper=True):
+            self._run(*band)
+
+    def _take(self, work: _Work | None = None, helper: bool = False) -> tuple[_Work, int, int, Any] | None:
+        """The next band of a launch, of the latest that has one left by default, and a command if one is recorded.
+
+        Bands become smaller towards the end, so that all threads come to it at once.
+        """
+        with self._lock:
+            for each in reversed(self._open) if work is None else [work]:
+                left = each.count - each.taken
+                if left > 0:
+                    size = each.count // _MOST_OF_A_LAUNCH
+                    if self.threads > 1:
+                        size = min(size, left // (2 * self.threads))
+                    begin = each.taken
+                    each.taken += min(max(size, each.least), left)
+                    return each, begin, each.taken, each.commands.pop() if each.commands else None
+            self._helpers -= helper
+        return None
+
+    def _run(self, work: _Work, begin: int, end: int, command: Any) -> None:
+        """Runs a band, unless all is cancelled."""
+        start = time.perf_counter()
+        wanted = work.whole or not self._cancelled.is_set()
+        try:
+            if wanted:
+                command = command or self._record(work)
+                command.set_param_at_index(0, begin)
+                command.set_dim(end - begin)
+                command.launch()
+        except BaseException as error:  # raised again by the thread that waits
+            work.error = error
+        seconds = time.perf_counter() - start
+        with self._lock:
+            if wanted:
+                self._pace[work.kernel] = seconds / (end - begin)
+            if command is not None:
+                work.commands.append(command)
+            if work.phase is not None:
+                self.profile.add(work.phase, seconds / self.threads)
+                if self._phase is not None:
+                    self.profile.add(self._phase, -seconds / self.threads)
+            work.run += end - begin
+            if work.run == work.count:
+                work.done.set()
 
     def resume(self) -> None:
         """Takes `cancel` back."""
@@ -115,8 +238,12 @@ class Launcher:
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Times what is launched inside under `name`."""
-        with self.profile.phase(name):
-            yield
+        outer, self._phase = self._phase, name
+        try:
+            with self.profile.phase(name):
+                yield
+        finally:
+            self._phase = outer
 
     def memory(self) -> float:
         """Bytes that may be allocated: what is free on a GPU, all there is on a CPU; infinity if unknown."""

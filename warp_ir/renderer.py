@@ -156,7 +156,7 @@ class Renderer:
         bits = len(self._moments).bit_length() - 1
         moment = self._moments[int(f"{iteration % (1 << bits):0{bits}b}"[::-1], 2) if bits else 0]
         moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
-        with self.launcher.phase("film"):
+        with self.launcher.phase("film"), self.launcher.undisturbed():  # no part of an iteration without the rest
             film.add(self._gbuffer, self._direct, self._indirect, moment.exposure)
         wp.synchronize_device(self.launcher.device)
 

@@ -162,9 +162,11 @@ class VplGatherer:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
         scramble = sampling.iteration_scramble(settings.seed, iteration)
-        with launcher.phase("primary"):
+
+        def look() -> None:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
-        with launcher.phase("emission"):
+
+        with launcher.beside("primary", look), launcher.phase("emission"):
             vpls = emit_vpls(
                 self._scene,
                 launcher,
