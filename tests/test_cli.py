@@ -239,6 +239,17 @@ def test_interruption_while_importing(tmp_path, number, said, command):
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", f"warp-ir: {said}\n")
 
 
+@pytest.mark.parametrize(("stage", "code"), [(ROOM, 0), ("nowhere.usda", 2)])
+def test_the_process_ends_in_order(stage, code):
+    """What others want done at the end is done, all output arrives, and the exit code is that of `main`."""
+    python = "import atexit; from warp_ir.cli import command; atexit.register(print, 'last'); command()"
+    process = [sys.executable, "-c", python, "info", str(stage)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(process, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == code
+    assert done.stdout.splitlines()[-1] == "last" and (len(done.stdout.splitlines()) > 5) == (code == 0)
+
+
 # ---- errors ----------------------------------------------------------------------------------------------
 
 

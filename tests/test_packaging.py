@@ -122,7 +122,7 @@ def test_license_is_complete():
 
 
 def test_entry_point_is_the_command():
-    """`warp-ir` is `warp_ir.cli.main`."""
-    from warp_ir.cli import main
+    """`warp-ir` is `warp_ir.cli.command`."""
+    from warp_ir.cli import command
 
-    assert 'warp-ir = "warp_ir.cli:main"' in PROJECT.splitlines() and callable(main)
+    assert 'warp-ir = "warp_ir.cli:command"' in PROJECT.splitlines() and callable(command)

@@ -1,7 +1,5 @@
 """``python -m warp_ir`` is the command `warp-ir`."""
 
-import sys
+from warp_ir.cli import command
 
-from warp_ir.cli import main
-
-sys.exit(main())
+command()

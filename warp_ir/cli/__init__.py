@@ -6,6 +6,7 @@ SIGTERM, the picture so far is written.
 Nothing heavy (Warp, USD, a picture library) is imported before a command needs it.
 """
 
+import atexit
 import importlib
 import os
 import signal
@@ -13,7 +14,8 @@ import sys
 import threading
 import traceback
 from collections.abc import Sequence
-from typing import Any
+from contextlib import suppress
+from typing import Any, NoReturn
 
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import say
@@ -22,6 +24,19 @@ from warp_ir.scene import InputError
 
 class Terminated(BaseException):
     """SIGTERM arrived; like KeyboardInterrupt, it unwinds so that nothing half-written stays behind."""
+
+
+def command() -> NoReturn:
+    """The process `warp-ir`: `main`, and the end of it.
+
+    Python would take apart every object of Warp, NumPy and USD, for half a second. The system does it at once.
+    """
+    code = main()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # no stream, or a broken one
+            stream.flush()
+    os._exit(code)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

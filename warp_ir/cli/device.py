@@ -1,7 +1,7 @@
 """Which device a command runs on."""
 
 from warp_ir.cli.console import muted_stderr
-from warp_ir.cli.signals import signals_wait
+from warp_ir.cli.importing import importing
 from warp_ir.scene import InputError
 
 
@@ -15,7 +15,7 @@ def open_device(name: str, *, verbose: bool = False) -> str:
     Raises:
         InputError: There is no such device; the message names those that there are.
     """
-    with signals_wait():
+    with importing():
         import warp as wp
 
     # This process is ours: Warp reports through our messages, or not at all.

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from warp_ir.cli.signals import signals_wait
+from warp_ir.cli.importing import importing
 from warp_ir.scene import InputError
 
 Moment = float | str | None
@@ -39,7 +39,7 @@ def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Pa
 
 def time_codes(spec: str) -> list[float]:
     """The numbers of a frame specification, without repetitions."""
-    with signals_wait():
+    with importing():
         from pxr import Tf, UsdUtils
 
     codes: dict[float, None] = {}

@@ -19,7 +19,7 @@ from warp_ir.cli.checkpoint import Checkpoint, fingerprint, path_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
 from warp_ir.cli.device import open_device
 from warp_ir.cli.frames import Moment, outputs_of, time_codes
-from warp_ir.cli.signals import signals_wait
+from warp_ir.cli.importing import importing
 from warp_ir.cli.stage import moment_of, open_reader
 from warp_ir.image import SUFFIXES, check_output, whole_file, write_image
 from warp_ir.scene import InputError
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if args.stats:
         check_output(args.stats, (".json",), make_folder=args.make_output_path)
     device = open_device(args.device, verbose=args.verbose)
-    with signals_wait():
+    with importing():
         _ = ir.load_usd, ir.Renderer  # imported here, so that their time is not the first frame's
     versions = _versions()
     imported = time.perf_counter() - begin

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from warp_ir.cli.signals import signals_wait
+from warp_ir.cli.importing import importing
 
 
 def open_reader(args: argparse.Namespace) -> Any:
@@ -12,7 +12,7 @@ def open_reader(args: argparse.Namespace) -> Any:
     Raises:
         InputError: The stage cannot be opened.
     """
-    with signals_wait():
+    with importing():
         from warp_ir.usd.load import StageReader
 
     return StageReader(
