@@ -342,6 +342,16 @@ def test_implicit_shapes_have_their_area_and_volume(tmp_path, kind, more, surfac
         assert (np.einsum("mci,mi->mc", mesh.normals, area_vectors(mesh)) > 0.0).all()
 
 
+@pytest.mark.parametrize(("kind", "more", "surface", "content"), IMPLICIT)
+def test_left_handed_implicit_shapes_face_inwards(tmp_path, kind, more, surface, content):
+    """The schema's left-hand rule turns normals round: the volume that the winding encloses is negative."""
+    text = f'def {kind} "S" {{ {more}\nuniform token orientation = "leftHanded"\n}}'
+    (mesh,) = load(tmp_path, text).meshes
+    assert area(mesh) == pytest.approx(surface, rel=2e-3) and volume(mesh) == pytest.approx(-content, rel=4e-3)
+    if mesh.normals is not None:
+        assert (np.einsum("mci,mi->mc", mesh.normals, area_vectors(mesh)) > 0.0).all()
+
+
 def test_the_normals_of_a_scaled_sphere_are_those_of_the_ellipsoid(tmp_path):
     """At a point p of an ellipsoid with half axes s the normal is along p / s²."""
     mesh = load(

@@ -5,9 +5,10 @@ Everything round is a lathe: a profile of arcs (r, z) with their normals, turned
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
-from pxr import Usd
+from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Floats
 from warp_ir.usd import value
@@ -47,7 +48,9 @@ def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> Shape:
         turn = {"X": [2, 1, 0], "Y": [0, 2, 1]}[axis]
     normals = None if shape.normals is None else shape.normals[:, :, turn]
     triangles = shape.triangles[:, ::-1] if kind == "Plane" and axis != "Z" else shape.triangles
-    return Shape(shape.points[:, turn], triangles, shape.face, shape.corner, normals)
+    shape = Shape(shape.points[:, turn], triangles, shape.face, shape.corner, normals)
+    left_handed = value.text(prim.GetAttribute("orientation"), time) == UsdGeom.Tokens.leftHanded
+    return _inside_out(shape) if left_handed else shape
 
 
 Size = Callable[[str, float], float]
@@ -168,6 +171,12 @@ def _lathe(profile: Profile) -> Shape:
     normals = turned(rows[row, 2], rows[row, 3], at).astype(np.float32)
     shape = _faceted(points, triangles)
     return Shape(shape.points, shape.triangles, shape.face, shape.corner, normals)
+
+
+def _inside_out(shape: Shape) -> Shape:
+    """The shape with its front inside: what emits shines inwards."""
+    normals = None if shape.normals is None else -shape.normals[:, ::-1]
+    return replace(shape, triangles=shape.triangles[:, ::-1], corner=shape.corner[:, ::-1], normals=normals)
 
 
 def _faceted(points: Floats, triangles: Floats) -> Shape:
