@@ -194,7 +194,8 @@ def test_inline_materialx(tmp_path, shader, inputs, albedo, emission):
     ("text", "word"),
     [
         (material_text(shader="Lambert"), "Lambert"),
-        (material_text(output="ri:surface"), "outputs:ri:surface"),
+        (material_text(output="ri:surface", shader="PxrVolume"), "PxrVolume"),
+        (material_text(output="ri:surface").replace("def Shader", "def NodeGraph"), "outputs:ri:surface"),
         ('def Material "A" {\n}\n', "no surface shader"),
         ("", "/A, does not exist"),
     ],

@@ -9,6 +9,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from warp_ir.scene import Floats, Texture, Wrap
 from warp_ir.usd import value
+from warp_ir.usd.foreign import shader_name
 from warp_ir.usd.images import Images
 from warp_ir.usd.report import Unreadable
 from warp_ir.usd.signal import Place, Primvar, Signal, as_color, combine, constant, from_primvar, select
@@ -27,6 +28,13 @@ _CHANNELS = {
     **dict.fromkeys(("float4", "vector4", "color4"), 4),
 }
 """Of what they read."""
+_FOREIGN_IMAGES = {
+    **dict.fromkeys(("arnold:image", "image", "PxrTexture"), "filename"),
+    "gltf_texture_lookup": "texture",
+    "file_texture": "texture",
+    "lookup_color": "tex",
+}
+"""Other renderers' nodes that read images: their inputs for the file."""
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
 
 
@@ -61,6 +69,57 @@ class Network:
             self.warn(f"{shader_input.GetBaseName()}: {trouble}; the default is used")
             return default
 
+    def word(self, shader_input: UsdShade.Input) -> str:
+        """A token that an input holds, or a number in digits; "" where there is none."""
+        attribute = value.producer(shader_input)
+        found = None if attribute is None else value.raw(attribute, self._time)
+        return "" if found is None else str(found)
+
+    def picture(
+        self, shader_input: UsdShade.Input, channels: list[int], uv: str, transform: Floats, *, color: bool
+    ) -> Signal | None:
+        """The image that an input names, repeated, or what is connected to it; None where no image can be read.
+
+        Args:
+            shader_input: An asset, or what takes a node.
+            channels: Numbers of those that are wanted, of r, g, b and a.
+            uv: The primvar that places it.
+            transform: What is done to it, [3, 3].
+            color: Whether it may be decoded.
+        """
+        attribute = value.producer(shader_input)
+        if attribute is None:
+            return None
+        self._nodes = 0
+        try:
+            if UsdShade.Output.IsOutput(attribute):
+                return self._input(shader_input, constant(*[0.0] * len(channels)), _DEPTH)
+            if not self._path(attribute):
+                return None
+            return self._file(attribute, channels, "auto" if color else "raw", _placed_by(uv, transform))
+        except Unreadable as trouble:
+            self.warn(f"{shader_input.GetBaseName()}: {trouble}; it is left out")
+            return None
+
+    def _file(
+        self,
+        attribute: Usd.Attribute | None,
+        channels: list[int],
+        space: str,
+        place: Callable[[tuple[int, int]], Place],
+        outside: Floats | None = None,
+    ) -> Signal:
+        """Channels of the image that an attribute names; `place` says where, given the UDIM tiles across and up.
+
+        Raises:
+            Unreadable: There is none.
+        """
+        outside = np.zeros(len(channels)) if outside is None else outside
+        _, pixels, key, atlas = self._images.look_up(
+            attribute, self._time, space, np.resize(outside, 4), channels, self.warn
+        )
+        return Signal(pixels, outside, place(atlas), (key, tuple(channels)), self._path(attribute))
+
     def _input(self, shader_input: UsdShade.Input, default: Signal, depth: int) -> Signal:
         attribute = value.producer(shader_input)
         if attribute is None:
@@ -70,7 +129,7 @@ class Network:
             if channels is None:
                 return default
             array = np.asarray(channels)
-            if array.ndim > 1 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+            if array.ndim > 1 or array.size == 0 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
                 what = "a finite colour" if array.shape == (3,) else "a finite number"
                 raise Unreadable(f"{attribute.GetName()} is {value.short(channels)}, not {what}")
             array = np.atleast_1d(array).astype(np.float64)
@@ -92,12 +151,18 @@ class Network:
             fallback = self._input(node.GetInput(otherwise), constant(*[0.0] * primvar.channels), depth - 1)
             return from_primvar(primvar, fallback)
         if identifier.startswith("ND_"):
-            if name.startswith(("image_", "tiledimage_")):
-                return self._image(node, name)
+            if name.startswith(("image_", "tiledimage_", "gltf_image_", "gltf_colorimage", "gltf_normalmap")):
+                return self._image(node, name, output)
             made = self._operation(node, name, output, depth - 1)
             if made is not None:
                 return made
-        raise Unreadable(f"the node {identifier} is not understood")
+        kind = shader_name(node)
+        if kind in _FOREIGN_IMAGES:
+            channels = {"a": [3], "resultA": [3]}.get(output, [0, 1, 2])
+            attribute = value.producer(node.GetInput(_FOREIGN_IMAGES[kind]))
+            uv = self._text(node.GetInput("uvset"), "st")
+            return self._file(attribute, channels, "auto", _placed_by(uv, np.eye(3)))
+        raise Unreadable(f"the node {kind or identifier} is not understood")
 
     def _operation(self, node: UsdShade.Shader, name: str, output: str, depth: int) -> Signal | None:
         """MaterialX's arithmetic; None if the node is none."""
@@ -183,21 +248,13 @@ class Network:
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
         return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), signal)
 
-    def _image(self, node: UsdShade.Shader, name: str) -> Signal:
-        """MaterialX's image and tiledimage."""
-        wanted = name.rsplit("_", 1)[-1]
-        count = {"float": 1, "vector2": 2, "color4": 4, "vector4": 4}.get(wanted, 3)
-        default = self._constant(node, "default", [0.0] * count)
+    def _image(self, node: UsdShade.Shader, name: str, output: str) -> Signal:
+        """MaterialX's image and tiledimage, and glTF's images in MaterialX."""
+        gltf = name.startswith("gltf_")
+        wanted = name.removesuffix("_1_0").rsplit("_", 1)[-1]
+        count = {"float": 1, "vector2": 2, "color4": 4, "vector4": 4, "colorimage": 4}.get(wanted, 3)
+        default = self._constant(node, "default", [0.5, 0.5, 1.0] if "normalmap" in name else [0.0] * count)
         attribute = value.producer(node.GetInput("file"))
-        try:
-            space = "auto" if wanted.startswith("color") else "raw"
-            channels = list(range(count))
-            _, pixels, key, atlas = self._images.look_up(
-                attribute, self._time, space, np.resize(default, 4), channels, self.warn
-            )
-        except Unreadable as trouble:
-            self.warn(f"{trouble}; the image's default is used")
-            return constant(*default.tolist())
         modes = [
             _MATERIALX_WRAPS.get(self._text(node.GetInput(f"{axis}addressmode"), "periodic"), Wrap.REPEAT)
             for axis in "uv"
@@ -208,8 +265,27 @@ class Network:
             offset = self._constant(node, "uvoffset", [0.0, 0.0])
             modes = [Wrap.REPEAT, Wrap.REPEAT]
             transform = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]]) @ transform
-        place = _placed(uv, transform, (modes[0], modes[1]), atlas)
-        return Signal(pixels, default, place, (key, count), self._path(attribute))
+        if gltf:
+            pivot, scale = self._constant(node, "pivot", [0.0, 1.0]), self._constant(node, "scale", [1.0, 1.0])
+            x, y = self._constant(node, "offset", [0.0, 0.0])
+            turn = _rotation(self._constant(node, "rotate", [0.0])[0])
+            transform = _moved(*pivot) @ _moved(x, -y) @ turn @ np.diag([*scale, 1.0]) @ _moved(*-pivot) @ transform
+        space = "auto" if wanted.startswith("color") else "raw"
+        try:
+            signal = self._file(
+                attribute, list(range(count)), space, _placed_by(uv, transform, (modes[0], modes[1])), default
+            )
+        except Unreadable as trouble:
+            self.warn(f"{trouble}; the image's default is used")
+            signal = constant(*default.tolist())
+        if name.startswith("gltf_normalmap"):
+            return combine("normalmap", _unpacked_normal, signal, constant(1.0))
+        for factor in ("factor", "color", "geomcolor") if gltf else ():
+            if value.producer(node.GetInput(factor)) is not None:
+                signal = combine("factor", np.multiply, signal, self._input(node.GetInput(factor), signal, _DEPTH))
+        if wanted == "colorimage":
+            return select(signal, [3] if output == "outa" else [0, 1, 2])
+        return signal
 
     def _path(self, attribute: Usd.Attribute | None) -> str:
         """The path that an asset attribute holds."""
@@ -270,6 +346,13 @@ def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
     """Normals from numbers between 0 and 1, by MaterialX's node normalmap, whose scale is for x and y."""
     across = np.broadcast_to(scale, (*scale.shape[:-1], 2))
     return np.asarray((2.0 * packed - 1.0) * np.concatenate([across, np.ones_like(scale[..., :1])], axis=-1))
+
+
+def _placed_by(
+    uv: str, transform: Floats, wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
+) -> Callable[[tuple[int, int]], Place]:
+    """Where an image lies, given its UDIM tiles."""
+    return lambda tiles: _placed(uv, transform, wrap, tiles)
 
 
 def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> Place:

@@ -13,6 +13,7 @@ from pxr import Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
+from warp_ir.usd.foreign import reader_of, shader_name
 from warp_ir.usd.images import Images
 from warp_ir.usd.light import BRIGHTEST
 from warp_ir.usd.network import Network
@@ -48,23 +49,29 @@ def read_material(
         Unreadable: The material has no surface shader that is understood.
     """
     path = material.GetPath()
-    known: list[str] = []
-    # The universal context first: MaterialX is read only where nothing else is offered.
-    for context in ("", "mtlx"):
-        source = material.ComputeSurfaceSource(context)[0]
-        if not source:
-            continue
-        shader = UsdShade.ConnectableAPI(source)
-        identifier = UsdShade.Shader(source).GetShaderId()
-        read = _READERS.get(identifier)
-        if read is not None:
-            return read(_Inputs(shader, Network(images, path, time), black_metals))
-        known.append(identifier)
     outputs = [str(o.GetFullName()) for o in material.GetSurfaceOutputs() if o.HasConnectedSource()]
-    shown = (known[0] or "without an id") if known else ""
-    what = f"its shader {shown} is not understood" if known else f"it offers only {', '.join(outputs)}"
-    if not known and not outputs:
-        what = "it has no surface shader"
+    # The universal context first: others are read only where it offers nothing that is understood.
+    contexts = dict.fromkeys(["", "mtlx", *(name.removeprefix("outputs:").rpartition(":")[0] for name in outputs)])
+    sources = [source for context in contexts if (source := material.ComputeSurfaceSource(context)[0])]
+    shaders = list({source.GetPath(): UsdShade.Shader(source) for source in sources}.values())
+    inputs = [_Inputs(s.ConnectableAPI(), Network(images, path, time), black_metals) for s in shaders]
+    for shader, found in zip(shaders, inputs, strict=True):
+        read = _READERS.get(shader.GetShaderId())
+        if read is not None:
+            return read(found)
+    for shader, found in zip(shaders, inputs, strict=True):
+        approximate = reader_of(shader)
+        terms = None if approximate is None else approximate(found)
+        if terms is not None:
+            found.warn(
+                f"of its shader {shader_name(shader)} base colour, emission and opacity are read ({{n}} materials)"
+            )
+            albedo = _metal(found, terms.metallic, terms.albedo)
+            normal = None if terms.normal is None else found.tangent_normal("normal", terms.normal)
+            return _surface(found, albedo, terms.emission, terms.opacity, terms.threshold, normal)
+    what = f"it offers only {', '.join(outputs)}" if outputs else "it has no surface shader"
+    if shaders:
+        what = f"its shader {shader_name(shaders[0]) or 'without an id'} is not understood"
     raise Unreadable(f"{what}; displayColor is used")
 
 
@@ -84,6 +91,32 @@ class _Inputs:
         found = self.network.evaluate(self._shader.GetInput(name), constant(default))
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
 
+    def has(self, name: str) -> bool:
+        """Whether an input has a value or a connection."""
+        given = value.producer(self._shader.GetInput(name))
+        return given is not None and bool(UsdShade.Output.IsOutput(given) or given.HasValue())
+
+    def pair(self, name: str, default: float) -> tuple[float, float]:
+        """Two numbers."""
+        found = np.resize(self.network.evaluate(self._shader.GetInput(name), constant(default, default)).mean, 2)
+        return float(found[0]), float(found[1])
+
+    def word(self, name: str) -> str:
+        """A token; a number in digits."""
+        return self.network.word(self._shader.GetInput(name))
+
+    def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
+        """The image that an input names, or what is connected to it; None where it names none that can be read.
+
+        Args:
+            name: Of the input.
+            channels: Numbers of those that are wanted, of r, g, b and a.
+            uv: The primvar that places the image.
+            transform: What is done to it, [3, 3].
+            color: Whether it may be decoded.
+        """
+        return self.network.picture(self._shader.GetInput(name), channels, uv, transform, color=color)
+
     def normal(self, name: str, *, tangent: bool) -> Signal | None:
         """A normal map, in tangent space; None where there is none, or a flat one.
 
@@ -98,10 +131,14 @@ class _Inputs:
             if not UsdShade.Output.IsOutput(given):
                 return None
             node = str(UsdShade.Shader(given.GetPrim()).GetShaderId() or "an unnamed node")
-            if not node.startswith("ND_normalmap"):
+            if not node.startswith(("ND_normalmap", "ND_gltf_normalmap")):
                 self.warn(f"{name}: only a normalmap is read, not {node}; the surface's own normals are used")
                 return None
         found = as_color(self.network.evaluate(self._shader.GetInput(name), constant(0.0, 0.0, 1.0)))
+        return self.tangent_normal(name, found)
+
+    def tangent_normal(self, name: str, found: Signal) -> Signal | None:
+        """A normal map in tangent space as it is stored; None for a flat one."""
         self.without_primvars(name, found)
         if np.abs(found.pixels).max() > 1.0:
             found = combine("normal", lambda n: np.clip(n, -1.0, 1.0), found)
@@ -152,7 +189,7 @@ def _preview_surface(inputs: _Inputs) -> Surface | None:
         if specular.pixels.max() > 0.05:
             inputs.warn("specular reflection rendered as diffuse ({n} materials)")
     else:
-        albedo = _metal(inputs, "metallic", albedo)
+        albedo = _metal(inputs, inputs.grey("metallic", 0.0), albedo)
     emission = inputs.color("emissiveColor", _BLACK)
     opacity, threshold = inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
     return _surface(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
@@ -165,7 +202,7 @@ def _standard_surface(inputs: _Inputs) -> Surface | None:
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 0.0))
     albedo = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
-    albedo = _coated(inputs, "coat", _metal(inputs, "metalness", albedo))
+    albedo = _coated(inputs, "coat", _metal(inputs, inputs.grey("metalness", 0.0), albedo))
     inputs.unrendered("sheen", "sheen")
     return _surface(inputs, albedo, emission, inputs.grey("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False))
 
@@ -177,17 +214,41 @@ def _open_pbr_surface(inputs: _Inputs) -> Surface | None:
     albedo = _scaled(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.grey("base_weight", 1.0))
     emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission_luminance", 0.0))
     albedo = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
-    albedo = _coated(inputs, "coat_weight", _metal(inputs, "base_metalness", albedo))
+    albedo = _coated(inputs, "coat_weight", _metal(inputs, inputs.grey("base_metalness", 0.0), albedo))
     inputs.unrendered("fuzz_weight", "sheen")
     opacity, normal = inputs.grey("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
     return _surface(inputs, albedo, emission, opacity, 0.0, normal)
+
+
+def _gltf_pbr(inputs: _Inputs) -> Surface | None:
+    """The material of glTF, as MaterialX has it."""
+    if inputs.number("transmission", 0.0) > 0.0:
+        inputs.warn("transmission is not rendered: the surface is opaque")
+    albedo = _metal(inputs, inputs.grey("metallic", 1.0), inputs.color("base_color", _WHITE))
+    emission = _scaled(inputs.color("emissive", _BLACK), inputs.grey("emissive_strength", 1.0))
+    mode = round(inputs.number("alpha_mode", 0.0))  # opaque, cut out, blended
+    opacity = inputs.grey("alpha", 1.0) if mode else constant(1.0)
+    threshold = inputs.number("alpha_cutoff", 0.5) if mode == 1 else 0.0
+    return _surface(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=False))
+
+
+def _unlit(inputs: _Inputs) -> Surface | None:
+    """MaterialX's surface that shows its emission and reflects nothing."""
+    emission = _scaled(inputs.color("emission_color", _WHITE), inputs.grey("emission", 1.0))
+    return _surface(inputs, constant(*_BLACK), emission, inputs.grey("opacity", 1.0), 0.0, None)
 
 
 _READERS = {
     "UsdPreviewSurface": _preview_surface,
     "ND_UsdPreviewSurface_surfaceshader": _preview_surface,
     "ND_standard_surface_surfaceshader": _standard_surface,
+    "ND_standard_surface_surfaceshader_100": _standard_surface,
     "ND_open_pbr_surface_surfaceshader": _open_pbr_surface,
+    "ND_gltf_pbr_surfaceshader": _gltf_pbr,
+    "ND_surface_unlit": _unlit,
+    # Arnold's have the inputs of the same names.
+    "arnold:standard_surface": _standard_surface,
+    "arnold:openpbr_surface": _open_pbr_surface,
 }
 
 
@@ -201,9 +262,8 @@ def _scaled(color: Signal, weight: Signal) -> Signal:
     return combine("scaled", np.multiply, color, weight)
 
 
-def _metal(inputs: _Inputs, name: str, albedo: Signal) -> Signal:
+def _metal(inputs: _Inputs, metallic: Signal, albedo: Signal) -> Signal:
     """The albedo of a surface that may be a metal, of which only its base colour is left, or nothing."""
-    metallic = inputs.grey(name, 0.0)
     if metallic.pixels.max() <= 0.0 and not metallic.primvars:
         return albedo
     if not inputs.black_metals:
