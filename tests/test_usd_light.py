@@ -214,7 +214,7 @@ SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
         ("GeometryLight", "", "", "geometry"),
         ("PluginLight", "", "", "PluginLight"),
         ("LightFilter", "", "", "light filters are not read"),
-        ("RenderPass", "", "", "render passes are not read"),
+        ("RenderPass", "", "", "no render pass is selected"),
         (
             "DomeLight",
             "",
@@ -521,6 +521,16 @@ def test_links_are_read(tmp_path, more, unlit, shadowless):
     assert [m.name for m in scene.meshes] == ["/Geom/a", "/Geom/b", "/Geom/c/inner"]
     assert scene.lights[0].unlit == frozenset(unlit) and scene.lights[0].shadowless == frozenset(shadowless)
     assert not warned(scene, "link")
+
+
+def test_links_by_expressions(tmp_path):
+    """Two lights with expressions of their own light what these match, and no other's."""
+    expression = "uniform bool collection:lightLink:includeRoot = 0\n"
+    expression += 'uniform pathExpression collection:lightLink:membershipExpression = "/Geom/{}"'
+    first = light_text("SphereLight", expression.format("a"))
+    second = light_text("SphereLight", expression.format("/inner")).replace('"L"', '"K"')
+    scene = load(tmp_path, first + second + LINKED)
+    assert [light.unlit for light in scene.lights] == [{1, 2}, {0, 1}]
 
 
 def test_lights_of_instanced_prototypes(tmp_path):

@@ -344,11 +344,80 @@ def test_the_names_of_usdrecord(tmp_path):
     out = tmp_path / "a.npy"
     flags = ["--defaultTime", "--sessionLayer", str(layer), "--renderSettingsPrimPath", "/Render/S"]
     assert main(["render", str(file), str(out), *FEW, *flags, "-cam", "A", "-w", "8"]) == 0
+    assert parse(["render", "a", "b", "--renderPassPrimPath", "/P"]).render_pass == "/P"
     flags = ["--disableGpu", "--disableCameraLight", "--enableDomeLightVisibility"]
     args = parse(["render", "a", "b", *flags])
     assert (args.device, args.default_light, args.visible_lights) == ("cpu", "none", True)
     args = parse(["render", "a", "b"])
     assert (args.device, args.default_light) == ("auto", "dome") and "visible_lights" not in args
+
+
+PASS = """
+def Xform "Set" {
+    def Cube "a" {
+    }
+    def Xform "b" {
+        def Cube "c" {
+        }
+    }
+}
+def PointInstancer "I" {
+    rel prototypes = </I/p>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = [(0, 0, 0), (4, 0, 0)]
+    def Cube "p" {
+    }
+}
+def RenderPass "Only" {
+    rel renderSource = </Render/S>
+    MORE
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "shapes", "lights", "outside"),
+    [
+        ("", {"/Floor", "/Set/a", "/Set/b/c", "/I/p"}, 1, 0),
+        ("rel collection:prune:includes = [</Set/b>, </Light>]", {"/Floor", "/Set/a", "/I/p"}, 0, 2),
+        ("rel collection:renderVisibility:excludes = [</Set>, </I>]", {"/Floor"}, 1, 3),
+        (
+            """uniform bool collection:renderVisibility:includeRoot = 0
+    rel collection:renderVisibility:includes = [</Set>, </Light>]
+    rel collection:renderVisibility:excludes = </Set/a>""",
+            {"/Set/b/c"},
+            1,
+            3,
+        ),
+        (
+            'uniform pathExpression collection:prune:membershipExpression = "/Set//c"',
+            {"/Floor", "/Set/a", "/I/p"},
+            1,
+            1,
+        ),
+    ],
+)
+def test_a_render_pass_says_what_takes_part(tmp_path, more, shapes, lights, outside):
+    """What is pruned is gone with all below it; what is outside renderVisibility is not drawn."""
+    file = stage(tmp_path, ROOM + SETTINGS + PASS.replace("MORE", more))
+    scene = load_usd(file, render_pass="Only", default_light="none")
+    assert {mesh.name for mesh in scene.meshes} == shapes and len(scene.lights) == lights
+    assert scene.stats["prims_outside_pass"] == outside and scene.settings["width"] == 40
+    assert not warned(scene, "/Only")
+    assert len(load_usd(file).meshes) == 4 and warned(load_usd(file), "/Only", "all is drawn")
+
+
+def test_render_passes_that_cannot_be_followed(tmp_path):
+    """A pass that is not there is an error, as are two sources of settings; what is not read of one is named."""
+    text = "rel collection:matte:includes = </Set>\n rel collection:cameraVisibility:excludes = </Set>"
+    file = stage(tmp_path, ROOM + PASS.replace("MORE", text))
+    with pytest.raises(InputError, match="no render pass '/P'; available: /Only"):
+        load_usd(file, render_pass="/P")
+    with pytest.raises(InputError, match="one of the two"):
+        load_usd(file, render_pass="/Only", render_settings="/S")
+    scene = load_usd(file, render_pass="/Only")
+    assert warned(scene, "/Only", "matte") and warned(scene, "/Only", "cameraVisibility")
+    assert warned(scene, "/Only", "renderSource") and scene.settings == {}
 
 
 # ---- malformed stages ------------------------------------------------------------------------------------

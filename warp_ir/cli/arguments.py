@@ -297,6 +297,9 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     wanted = "RenderSettings to honour (default: those the stage names, or its first)"
     group.add_argument("--render-settings", "-rs", metavar="PRIM", help=wanted)
     group.add_argument("--renderSettingsPrimPath", dest="render_settings", help=hidden)
+    taking = "RenderPass whose settings are used, and of which only what takes part is drawn"
+    group.add_argument("--render-pass", "-rp", metavar="PRIM", help=taking)
+    group.add_argument("--renderPassPrimPath", dest="render_pass", help=hidden)
     group.add_argument(
         "--purposes",
         type=_names(_PURPOSES),

@@ -17,6 +17,7 @@ from warp_ir.scene import Light, LightKind, Material, Mesh, MeshLight, Scene
 _SKIPPED = (
     "prims_invisible",
     "prims_other_purpose",
+    "prims_outside_pass",
     "degenerate_faces",
     "triangles_absent",
     "unused_materials",
@@ -182,6 +183,7 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     if camera["exposure"] != 1.0:
         _row("exposure", f"{camera['exposure']:.4g} times the radiance")
     _list("settings", _settings_lines(facts), most)
+    _list("render passes", facts["render_passes"], most)
     moving = f", {facts['moving_meshes']} of them move or change" if facts["moving_meshes"] else ""
     _row("meshes", f"{facts['meshes']}{moving}")
     seen = f"; {facts['triangles_seen']} are seen" if facts["prototypes"] else ""

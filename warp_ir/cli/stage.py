@@ -25,6 +25,7 @@ def open_reader(args: argparse.Namespace) -> Any:
         texture_wrap=args.texture_wrap,
         strict=args.strict,
         render_settings=args.render_settings,
+        render_pass=args.render_pass,
         mask=args.mask,
         variants=args.variants,
         session_layer=args.session_layer,
@@ -39,7 +40,7 @@ def moment_of(args: argparse.Namespace) -> float | str | None:
 
 def stage_facts(reader: Any) -> dict[str, Any]:
     """Axis, unit, frames, cameras and settings: what a renderer does not need to know, and a user might."""
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdRender
 
     from warp_ir.usd.camera import all_cameras
     from warp_ir.usd.render_spec import render_settings_prims
@@ -55,6 +56,7 @@ def stage_facts(reader: Any) -> dict[str, Any]:
             "meters_per_unit": float(UsdGeom.GetStageMetersPerUnit(stage)),
             "frames": frames,
             "cameras": [str(prim.GetPath()) for prim in all_cameras(stage)],
+            "render_passes": [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Pass)],
             "render_settings": {
                 "used": spec.path,
                 "all": [str(prim.GetPath()) for prim in render_settings_prims(stage)],

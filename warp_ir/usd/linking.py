@@ -9,6 +9,7 @@ from pxr import Sdf, Usd, UsdLux
 
 from warp_ir.scene import Light, Mesh, MeshLight
 from warp_ir.usd import value
+from warp_ir.usd.render_pass import includes
 
 _Links = tuple[frozenset[int], frozenset[int]]
 """Unlit and shadowless meshes."""
@@ -66,12 +67,8 @@ def _outside(collection: Usd.CollectionAPI, meshes: Sequence[Mesh], known: dict[
     if not _says(collection):
         return frozenset()
     query = collection.ComputeMembershipQuery()
-    key = frozenset((str(path), str(rule)) for path, rule in query.GetAsPathExpansionRuleMap().items())
+    rules = frozenset((str(path), str(rule)) for path, rule in query.GetAsPathExpansionRuleMap().items())
+    key = rules, query.UsesPathExpansionRuleMap() or str(collection.ResolveCompleteMembershipExpression())
     if key not in known:
-        known[key] = frozenset(k for k, mesh in enumerate(meshes) if not _includes(query, mesh.name))
+        known[key] = frozenset(k for k, mesh in enumerate(meshes) if not includes(query, Sdf.Path(mesh.name)))
     return known[key]
-
-
-def _includes(query: Any, name: str) -> bool:
-    included = query.IsPathIncluded(Sdf.Path(name))
-    return bool(included[0] if isinstance(included, tuple) else included)

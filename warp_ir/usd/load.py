@@ -18,6 +18,7 @@ from warp_ir.usd.images import Images
 from warp_ir.usd.light import LIGHTS, read_light
 from warp_ir.usd.linking import link
 from warp_ir.usd.motion import Motion
+from warp_ir.usd.render_pass import find_render_pass
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
@@ -39,6 +40,7 @@ _COUNTED = (
     "prototype_places",
     "prims_invisible",
     "prims_other_purpose",
+    "prims_outside_pass",
     "degenerate_faces",
     "triangles_absent",
     "unused_materials",
@@ -100,6 +102,7 @@ class StageReader:
         texture_wrap: str = "black",
         strict: bool = False,
         render_settings: str | None = None,
+        render_pass: str | None = None,
         mask: Sequence[str] = (),
         variants: Sequence[str] = (),
         session_layer: str | os.PathLike[str] | None = None,
@@ -122,6 +125,7 @@ class StageReader:
             strict: Whether the first warning is an error.
             render_settings: Path of a RenderSettings prim; None: the one that the stage's metadata name, else the
                 first.
+            render_pass: Path or name of a RenderPass prim: its settings, and what takes part in it; None: all does.
             mask: Paths of prims: only they, what is above, below and related to them, and camera and render settings
                 that are given by their paths, are loaded; () is all.
             variants: Selections of variants, `/prim{set=selection}`.
@@ -142,6 +146,8 @@ class StageReader:
             raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
         if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
             raise InputError(f"texture_wrap: '{texture_wrap}' is not one of black, clamp, repeat, mirror")
+        if render_settings is not None and render_pass is not None:
+            raise InputError("render_pass: a pass has its own render settings; give one of the two")
         self._camera, self._purposes, self._default_light = camera, purposes, default_light
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _LEVELS[complexity]
@@ -152,11 +158,14 @@ class StageReader:
                 self.source,
                 self._opened,
                 mask=mask,
-                needed=[path for path in (camera, render_settings) if path and path.startswith("/")],
+                needed=[path for path in (camera, render_settings, render_pass) if path and path.startswith("/")],
                 variants=variants,
                 session_layer=None if session_layer is None else os.fspath(session_layer),
             )
             self._axis = up_axis(self.stage, self._opened)
+            self._pass = find_render_pass(self.stage, render_pass, self._opened)
+            if self._pass is not None:
+                self._render_settings = self._pass.settings or None
             self._motion = Motion(self.stage)
         self._still: _Still | None = None
         self._shapes: dict[Any, Any] = {}
@@ -280,7 +289,7 @@ class StageReader:
     def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
         """What is drawn, and where; what stays the same at all times is read the first time."""
         report = self._opened.part()
-        found = walk(self.stage, time, key[:-2], report)
+        found = walk(self.stage, time, key[:-2], report, self._pass)
         moving, staying = Found(), Found()
         for name in ("shapes", "lights"):
             for site in getattr(found, name):

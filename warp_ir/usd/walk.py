@@ -12,6 +12,7 @@ from warp_ir.usd import value
 from warp_ir.usd.implicit import IMPLICIT
 from warp_ir.usd.instancing import Level, read_instancer
 from warp_ir.usd.light import LIGHTS
+from warp_ir.usd.render_pass import RenderPass
 from warp_ir.usd.report import Report, Unreadable
 
 _DEPTH = 16
@@ -65,17 +66,31 @@ class _Visit:
     instancers: tuple[Sdf.Path, ...]
 
 
-def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: Collection[str], report: Report) -> Found:
+def walk(
+    stage: Usd.Stage,
+    time: Usd.TimeCode,
+    purposes: Collection[str],
+    report: Report,
+    render_pass: RenderPass | None = None,
+) -> Found:
     """Visit every prim once per instancer that draws it, and gather gprims and lights.
 
-    Invisible subtrees and gprims of other purposes are counted and left out.
+    Invisible subtrees, gprims of other purposes and what takes no part in the render pass are counted and left out.
     """
-    return _Walk(stage, time, purposes, report).run()
+    return _Walk(stage, time, purposes, report, render_pass).run()
 
 
 class _Walk:
-    def __init__(self, stage: Usd.Stage, time: Usd.TimeCode, purposes: Collection[str], report: Report) -> None:
+    def __init__(
+        self,
+        stage: Usd.Stage,
+        time: Usd.TimeCode,
+        purposes: Collection[str],
+        report: Report,
+        render_pass: RenderPass | None,
+    ) -> None:
         self._stage, self._time, self._purposes, self._report = stage, time, purposes, report
+        self._pass = render_pass
         self._transforms = UsdGeom.XformCache(time)
         self._found = Found()
         self._unread: Counter[str] = Counter()
@@ -93,6 +108,9 @@ class _Walk:
         """Gather one prim, and return what is below it."""
         prim, report = visit.prim, self._report
         level, local, purpose = visit.level, visit.local, visit.purpose
+        if self._pass is not None and self._pass.prunes(prim):
+            report.stats["prims_outside_pass"] += 1
+            return []
         name = "default"
         if prim.IsA(UsdGeom.Imageable):
             imageable = UsdGeom.Imageable(prim)
@@ -108,6 +126,8 @@ class _Walk:
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         site = Site(prim, level, local)
         if kind == "PointInstancer":
+            if not self._takes_part(prim):
+                return []
             return self._instances(visit, level, local, purpose)
         if kind in _SHAPES:
             if self._is_drawn(prim, name):
@@ -124,7 +144,8 @@ class _Walk:
             if self._is_drawn(prim, name):
                 report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
         elif kind == "RenderPass":
-            report.warn(prim.GetPath(), "render passes are not read: all is drawn, in one picture")
+            if self._pass is None:
+                report.warn(prim.GetPath(), "no render pass is selected: all is drawn, whatever takes part in this one")
         elif kind in ("LightFilter", "PluginLightFilter"):
             report.warn(prim.GetPath(), "light filters are not read")
         elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
@@ -156,7 +177,7 @@ class _Walk:
         return level, parent if local == _IDENTITY else parent @ matrix
 
     def _is_drawn(self, prim: Usd.Prim, purpose: str) -> bool:
-        """Whether a prim's purpose is wanted, and not hidden by VisibilityAPI."""
+        """Whether a prim's purpose is wanted, not hidden by VisibilityAPI, and the prim part of the render pass."""
         if purpose not in self._purposes:
             self._report.stats["prims_other_purpose"] += 1
             self._report.stats[f"prims_{purpose}"] += 1
@@ -166,7 +187,14 @@ class _Walk:
             if effective == UsdGeom.Tokens.invisible:
                 self._report.stats["prims_invisible"] += 1
                 return False
-        return True
+        return self._takes_part(prim)
+
+    def _takes_part(self, prim: Usd.Prim) -> bool:
+        """Whether a prim is visible in the render pass, if there is one."""
+        if self._pass is None or self._pass.shows(prim):
+            return True
+        self._report.stats["prims_outside_pass"] += 1
+        return False
 
     def _add_light(self, site: Site) -> None:
         if site.level.total > LIGHT_COPIES:
