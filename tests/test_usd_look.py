@@ -412,6 +412,58 @@ def test_arithmetic_on_primvars(tmp_path):
     assert not warned(scene, "primvar")
 
 
+@pytest.mark.parametrize(
+    ("interpolation", "values", "expected"),
+    [
+        ("constant", [0.5], [0.5] * 4),
+        ("uniform", [0.25, 0.75], [0.25, 0.25, 0.75, 0.75]),
+        ("vertex", [0, 0, 0.75, 0.75, 0, 0.75], [0.25, 0.5, 0.25, 0.5]),
+        ("faceVarying", [0, 0, 0.75, 0.75, 0.75, 0.75, 0.75, 0.75], [0.25, 0.5, 0.75, 0.75]),
+    ],
+)
+def test_primvars_that_emit_or_are_not_there(tmp_path, interpolation, values, expected):
+    """Emission and opacity are those of each triangle; within one, the mean; and the fallback where there is none."""
+    primvars = f"float[] primvars:r = {values} (interpolation = '{interpolation}')"
+    inputs = """float inputs:emission.connect = </A/r.outputs:out>
+        float inputs:opacity.connect = </A/r.outputs:out>
+        color3f inputs:emission_color = (4, 8, 16)"""
+    scene = load(tmp_path, painted(reader("r", "float"), primvars, inputs))
+    one, two = scene.meshes
+    looks = [scene.materials[k] for k in one.material]
+    np.testing.assert_allclose([m.emission for m in looks], np.outer(expected, (4, 8, 16)), rtol=1e-6)
+    np.testing.assert_allclose([m.opacity for m in looks], expected, rtol=1e-6)
+    assert scene.materials[two.material[0]].emission == (1.0, 2.0, 4.0)
+    assert scene.materials[two.material[0]].opacity == 0.25
+    assert warned(scene, "/M", "mean over each triangle") == (interpolation in ("vertex", "faceVarying"))
+    assert warned(scene, "/M", "partial opacity")
+
+
+def test_primvars_cut_out(tmp_path):
+    """A threshold is for what primvars say, and where they say nothing for the fallback: nothing may be there."""
+    nodes = """
+    def Shader "P" {
+        uniform token info:id = "UsdPrimvarReader_float"
+        string inputs:varname = "there"
+        float outputs:result
+    }
+"""
+    text = material_text("float inputs:opacity.connect = </A/P.outputs:result>\n float inputs:opacityThreshold = 0.5")
+    text = text.rstrip()[:-1] + nodes + "}\n"
+    there = "float[] primvars:there = [0.25, 0.75] (interpolation = 'uniform')"
+    scene = load(tmp_path, text + mesh(there) + mesh("", "N"))
+    (one,) = scene.meshes
+    assert one.name == "/M" and len(one.triangles) == 2 and one.points[one.triangles][..., 0].min() == 1.0
+    assert scene.stats["triangles_absent"] == 6 and only_material(scene).opacity == 1.0
+
+
+@pytest.mark.parametrize(("mode", "glow"), [("", 4.0), ('token inputs:opacityMode = "presence"', 1.0)])
+def test_what_is_transparent_emits_all_the_same(tmp_path, mode, glow):
+    """opacityMode: a transparent surface emits as if it were opaque, one that is partly not there loses that part."""
+    text = f"float inputs:opacity = 0.25\n color3f inputs:emissiveColor = (1, 1, 1)\n {mode}"
+    material = only_material(load(tmp_path, material_text(text) + mesh()))
+    assert material.emission == pytest.approx((glow,) * 3) and material.opacity == 0.25
+
+
 def test_primvars_under_a_coat_and_of_metals(tmp_path):
     """A coat tints a primvar, and a strictly black metal keeps its part of it."""
     inputs = """color3f inputs:base_color.connect = </A/C.outputs:out>
@@ -565,11 +617,11 @@ def test_what_is_read_in_vain_is_named(tmp_path, image):
     """Normal maps, and primvars where only constants and images count, are said once; unset interfaces are not."""
     target = "float inputs:displacement"
     assert warned(load(tmp_path, textured(output="r", target=target) + mesh()), "/A", "displacement", "not rendered")
-    opacity = textured(target="float inputs:opacity", output="result").replace("UsdUVTexture", "UsdPrimvarReader_float")
-    opacity = opacity.replace(
-        "asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1'
+    cut = textured(target="float inputs:opacityThreshold", output="result").replace(
+        "UsdUVTexture", "UsdPrimvarReader_float"
     )
-    assert warned(load(tmp_path, opacity + mesh()), "/A", "opacity", "'veil'")
+    cut = cut.replace("asset inputs:file = @a.png@", 'string inputs:varname = "veil"\n float inputs:fallback = 1')
+    assert warned(load(tmp_path, cut + mesh()), "/A", "opacityThreshold", "'veil'")
     plain = material_text("float inputs:displacement.connect = </A.inputs:unset>").replace(
         "token outputs:surface.connect", "float inputs:unset\n token outputs:surface.connect"
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
@@ -10,15 +11,18 @@ from warp_ir.scene import Floats, Ints, Material
 from warp_ir.usd import primvar, value
 from warp_ir.usd.binding import PURPOSES, bound_materials, order_of
 from warp_ir.usd.images import Images
+from warp_ir.usd.light import BRIGHTEST
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape
 from warp_ir.usd.signal import Signal
-from warp_ir.usd.surface import read_material
+from warp_ir.usd.surface import Surface, read_material
 
 ABSENT = -1
 """In place of a material's index: the surface is not there (opacity)."""
 UNBOUND = -2
 """In place of a material's index: no material that can be read; displayColor decides."""
+_MOST_VARIED = 2**16
+"""Materials that primvars of one prim may ask for; beyond, their mean is enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +69,7 @@ class MaterialTable:
         self._time, self._report = time, report
         self._images, self._black_metals = images or Images(report), metals == "black"
         self._images.report = report
-        self._asked: dict[int, Signal] = {}
+        self._asked: dict[int, Surface] = {}
         self._known: dict[Material, int] = {}
         self._read: dict[Sdf.Path, int] = {}
         self._bound: dict[Sdf.Path, int] = {}
@@ -105,20 +109,17 @@ class MaterialTable:
         if not bare.any() and not asked:
             return Look(index)
         colors: Floats | None = None
-        for k, albedo in asked.items():
-            color = self._from_primvars(prim, shape, albedo)
-            if color is None:
-                continue
+        for k, surface in asked.items():
             chosen = index == k
             material = self.materials[k]
-            if material.albedo_texture is not None:
-                self._report.warn(material.name, "its image counts as its mean where primvars are read")
-                material = replace(material, albedo_texture=None)
-            if color.ndim == 1:
-                red, green, blue = color.tolist()
-                material = replace(material, albedo=(red, green, blue))
-            index[chosen] = self.add(material)
-            if color.ndim > 1:
+            color = self._from_primvars(prim, shape, surface.albedo, "albedo", 1.0)
+            if color is not None:
+                material = self._without_image(material, albedo_texture=None)
+                if color.ndim == 1:
+                    red, green, blue = color.tolist()
+                    material = replace(material, albedo=(red, green, blue))
+            index[chosen] = self._varied(prim, shape, surface, material)[chosen]
+            if color is not None and color.ndim > 1:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
         if not bare.any():
@@ -132,20 +133,74 @@ class MaterialTable:
             look, colors=colors if look.colors is None else np.where(chosen[:, None, None], look.colors, colors)
         )
 
-    def _from_primvars(self, prim: Usd.Prim, shape: Shape, albedo: Signal) -> Floats | None:
-        """An albedo that depends on primvars, [3] or [m, 3, 3]; None if the prim has none of them."""
+    def _without_image(self, material: Material, **none: Any) -> Material:
+        """The material without one of its images, whose mean is used."""
+        plain = replace(material, **none)
+        if plain != material:
+            self._report.warn(material.name, "its image counts as its mean where primvars are read")
+        return plain
+
+    def _varied(self, prim: Usd.Prim, shape: Shape, surface: Surface, material: Material) -> Ints:
+        """The material of each triangle, int32 [m], where emission or opacity may depend on primvars."""
+        count = len(shape.triangles)
+        emission = self._from_primvars(prim, shape, surface.emission, "emission", BRIGHTEST)
+        opacity = self._from_primvars(prim, shape, surface.opacity, "opacity", 1.0)
+        if opacity is None and surface.opacity is not None:
+            opacity = surface.opacity.mean.clip(0.0, 1.0)
+        if emission is None and opacity is None:
+            return np.full(count, self.add(material), dtype=np.int32)
+        rows = np.empty((count, 4), np.float32)
+        rows[:, :3], rows[:, 3] = material.emission, material.opacity
+        if emission is not None:
+            material = self._without_image(material, emission_texture=None)
+            rows[:, :3] = self._of_triangles(prim, emission, "emission")
+        if opacity is not None:
+            material = self._without_image(replace(material, cutoff=0.0), opacity_texture=None)
+            rows[:, 3] = self._of_triangles(prim, opacity, "opacity")[..., 0]
+            if surface.threshold > 0.0:
+                rows[:, 3] = rows[:, 3] >= surface.threshold
+            if ((rows[:, 3] > 0.0) & (rows[:, 3] < 1.0)).any():
+                what = "partial opacity lets a share of the light through, straight on ({n} in all)"
+                self._report.warn(prim.GetPath(), what)
+        distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
+        if len(distinct) > _MOST_VARIED:
+            what = f"emission and opacity of its primvars have {len(distinct)} values: their mean is used"
+            self._report.warn(prim.GetPath(), what)
+            distinct, inverse = rows.mean(axis=0, keepdims=True), np.zeros(count, np.int64)
+        return np.array([self._variant(material, row) for row in distinct.tolist()], np.int32)[inverse.reshape(-1)]
+
+    def _of_triangles(self, prim: Usd.Prim, corners: Floats, what: str) -> Floats:
+        """Values [c] or [m, 3, c] as those of triangles, [c] or [m, c]: where they differ within one, their mean."""
+        if corners.ndim == 1:
+            return corners
+        if not np.allclose(corners, corners[:, :1], rtol=1e-6):
+            self._report.warn(prim.GetPath(), f"{what} of primvars is rendered as its mean over each triangle")
+        means: Floats = corners.mean(axis=1)
+        return means
+
+    def _variant(self, material: Material, row: Sequence[float]) -> int:
+        """Index of the material with an emission and opacity (rgb, o), or ABSENT."""
+        red, green, blue, opacity = row
+        if opacity <= 0.0:
+            return ABSENT
+        return self.add(replace(material, emission=(red, green, blue), opacity=opacity))
+
+    def _from_primvars(
+        self, prim: Usd.Prim, shape: Shape, signal: Signal | None, what: str, largest: float
+    ) -> Floats | None:
+        """What depends on primvars, [c] or [m, 3, c]; None if nothing does, or if the prim has none of them."""
         values = {}
-        for asked in albedo.primvars:
+        for asked in () if signal is None else signal.primvars:
             found = primvar.corner_values(prim, shape, asked.name, asked.channels, self._time, self._report)
             if found is not None:
                 values[asked] = found
-        if not values:
+        if signal is None or not values:
             return None
-        colors = albedo.at(values)
-        if colors.min() < 0.0 or colors.max() > 1.0:
+        found = signal.at(values)
+        if found.min() < 0.0 or found.max() > largest:
             names = ", ".join(asked.name for asked in values)
-            self._report.warn(prim.GetPath(), f"albedo of the primvar {names} outside [0, 1] clamped")
-        return colors.clip(0.0, 1.0)
+            self._report.warn(prim.GetPath(), f"{what} of the primvar {names} outside [0, {largest:g}] clamped")
+        return found.clip(0.0, largest)
 
     def _bare(self, prim: Usd.Prim, shape: Shape, index: Ints, bare: Mask) -> Look:
         """The look of a prim of whose triangles some have no material."""
@@ -219,8 +274,8 @@ class MaterialTable:
             try:
                 read = read_material(material, self._time, self._images, black_metals=self._black_metals)
                 self._read[path] = ABSENT if read is None else self.add(read.material)
-                if read is not None and read.albedo is not None:
-                    self._asked[self._read[path]] = read.albedo
+                if read is not None and (read.albedo or read.emission or read.opacity):
+                    self._asked[self._read[path]] = read
             except Unreadable as trouble:
                 self._report.warn(material.GetPath(), str(trouble))
                 self._read[path] = UNBOUND

@@ -23,6 +23,8 @@ from warp_ir.usd.signal import Place, Signal, as_color, combine, constant
 _GREY: Color = (0.18, 0.18, 0.18)
 _BLACK: Color = (0.0, 0.0, 0.0)
 _WHITE: Color = (1.0, 1.0, 1.0)
+_FAINTEST = 0.02
+"""Opacity down to which a transparent surface emits in full: few rays meet it, and what they bring is its inverse."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,12 @@ class Surface:
     material: Material
     albedo: Signal | None = None
     """If it depends on primvars: what the albedo is where surfaces have them."""
+    emission: Signal | None = None
+    """Likewise."""
+    opacity: Signal | None = None
+    """Likewise."""
+    threshold: float = 0.0
+    """Of the opacity: if it is more than 0, surfaces below it are absent, and others opaque."""
 
 
 def read_material(
@@ -192,6 +200,9 @@ def _preview_surface(inputs: _Inputs) -> Surface | None:
         albedo = _metal(inputs, inputs.grey("metallic", 0.0), albedo)
     emission = inputs.color("emissiveColor", _BLACK)
     opacity, threshold = inputs.grey("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
+    if threshold <= 0.0 and inputs.word("opacityMode") != "presence" and emission.pixels.max() > 0.0:
+        # What is transparent emits all the same, and the renderer loses the light of what is not there.
+        emission = combine("glow", lambda e, o: e / np.clip(o, _FAINTEST, 1.0), emission, opacity)
     return _surface(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
 
 
@@ -309,8 +320,6 @@ def _surface(
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
         inputs.warn(f"albedo {_numbers(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _unit, albedo)
-    inputs.without_primvars("emission", emission)
-    inputs.without_primvars("opacity", opacity)
     if float(emission.pixels.max()) >= BRIGHTEST:
         inputs.warn(f"emission {_numbers(emission)} is beyond reason; it emits nothing")
         emission = constant(*_BLACK)
@@ -323,7 +332,7 @@ def _surface(
         values = np.append(values, opacity.outside)
     if threshold > 0.0:
         values = (values >= threshold).astype(np.float64)
-    if values.max() <= 0.0:
+    if values.max() <= 0.0 and not opacity.primvars:
         return None
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
@@ -342,7 +351,8 @@ def _surface(
         network.texture(_bounded(opacity)) if textured else None,
         normal_texture=None if normal is None else network.texture(normal),
     )
-    return Surface(material, albedo if albedo.primvars else None)
+    albedo_of, emission_of, opacity_of = (x if x.primvars else None for x in (albedo, emission, opacity))
+    return Surface(material, albedo_of, emission_of, opacity_of, threshold)
 
 
 def _bounded(signal: Signal) -> Signal:
