@@ -295,21 +295,22 @@ def test_velocities_that_do_not_fit_are_named(tmp_path, velocities, word):
 @pytest.mark.parametrize(
     "opacity, expected, word",
     [
-        ("[0.5]", 0.5, "partial opacity"),
-        ("[1, 1]", 1.0, None),
-        ("[]", 1.0, None),
-        ("[0.25, 0.5, 0.75, 0.5] (interpolation = 'vertex')", 0.5, "its mean is used"),
-        ("[0]", None, None),
+        ("[0.5]", [0.5], "partial opacity"),
+        ("[1, 1]", [1.0], None),
+        ("[]", [1.0], None),
+        ("[0.2, 0.2, 0.8, 0.6] (interpolation = 'vertex')", [0.4, 8 / 15], "partial opacity"),
+        ("[0, 0, 0, 0.6] (interpolation = 'vertex')", [0.2], "partial opacity"),
+        ("[0]", [], None),
     ],
 )
 def test_opacity_without_a_material(tmp_path, color, opacity, expected, word):
-    """DisplayOpacity is the surface's where no material is bound; at 0 there is none."""
+    """DisplayOpacity is the surface's where no material is bound, the mean of each triangle; at 0 there is none."""
     text = f"float[] primvars:displayOpacity = {opacity}\n{color}"
     scene = load(tmp_path, mesh_text(SQUARE, [4], range(4), text))
-    if expected is None:
+    if not expected:
         assert not scene.meshes and scene.stats["triangles_absent"] == 2
     else:
-        assert [m.opacity for m in scene.materials] == [pytest.approx(expected)]
+        assert [m.opacity for m in scene.materials] == pytest.approx(expected)
     assert warned(scene, "/M", word or "pacity") == (word is not None)
 
 

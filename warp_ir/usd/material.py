@@ -205,20 +205,25 @@ class MaterialTable:
     def _bare(self, prim: Usd.Prim, shape: Shape, index: Ints, bare: Mask) -> Look:
         """The look of a prim of whose triangles some have no material."""
         color = primvar.display_color(prim, shape, self._time, self._report)
-        opacity = primvar.display_opacity(prim, shape, self._time, self._report)
-        if opacity <= 0.0:
-            index[bare] = ABSENT
-            return Look(index)
         if color is None:
-            index[bare] = self.add(Material("no material", opacity=opacity))
+            self._index_bare(index, bare, prim, shape, Material("no material"))
             return Look(index, bare=bare)
         if color.ndim == 1:
             red, green, blue = color.tolist()
-            index[bare] = self.add(Material("displayColor", (red, green, blue), opacity=opacity))
+            self._index_bare(index, bare, prim, shape, Material("displayColor", (red, green, blue)))
             return Look(index)
-        index[bare] = self.add(Material("displayColor", opacity=opacity))
+        self._index_bare(index, bare, prim, shape, Material("displayColor"))
+        if not self.materials:
+            return Look(index)
         colors = np.where(bare[:, None, None], color.astype(np.float32), self.albedo(index)[:, None])
         return Look(index, colors)
+
+    def _index_bare(self, index: Ints, bare: Mask, prim: Usd.Prim, shape: Shape, material: Material) -> None:
+        """Gives a material to the triangles that have none, of the prim's own displayOpacity."""
+        opacity = primvar.display_opacity(prim, shape, self._time, self._report)
+        distinct, inverse = np.unique(opacity, return_inverse=True)
+        variants = [self._variant(material, (*material.emission, value)) for value in distinct.tolist()]
+        index[bare] = np.array(variants, np.int32)[np.broadcast_to(inverse.reshape(-1), index.shape)][bare]
 
     def _uvs(self, prim: Usd.Prim, shape: Shape, index: Ints) -> dict[str, Floats]:
         """The texture coordinates that a prim's materials need, and that it has."""

@@ -102,18 +102,18 @@ def display_color(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Repo
     return colors.clip(0.0, 1.0)
 
 
-def display_opacity(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> float:
-    """The prim's own or inherited displayOpacity, 1 if unset; the mean of the corners where it differs, and named."""
+def display_opacity(prim: Usd.Prim, shape: Shape, time: Usd.TimeCode, report: Report) -> Floats:
+    """The prim's own or inherited displayOpacity, 1 if unset; [1], or [m] where triangles differ, in 255ths."""
     authored = value.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
     if np.all(np.asarray(1.0 if authored is None else authored) == 1.0):
-        return 1.0
+        return np.ones(1)
     found = corner_values(prim, shape, "displayOpacity", 1, time, report)
     if found is None:
-        return 1.0
+        return np.ones(1)
+    opacity: Floats = found.clip(0.0, 1.0).reshape(len(found), -1).mean(axis=1)
     if found.ndim > 1:
-        report.warn(prim.GetPath(), "displayOpacity differs over the surface: its mean is used")
-    opacity = float(found.clip(0.0, 1.0).mean())
-    if 0.0 < opacity < 1.0:
+        opacity = np.round(opacity * 255.0) / 255.0
+    if ((opacity > 0.0) & (opacity < 1.0)).any():
         report.warn(prim.GetPath(), "partial opacity lets a share of the light through, straight on ({n} in all)")
     return opacity
 
