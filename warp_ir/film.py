@@ -1,6 +1,7 @@
-"""The film: a sum, a sum of squares and a count. Iterations add, films merge, the picture is the mean.
+"""The film: a mean, a standard deviation and a count. Iterations add, films merge, the picture is the mean.
 
-Sums are float64, so that a hundred thousand iterations leave no drift.
+Both are brought up to date by how far each iteration is off the mean (Welford 1962): what is lost to rounding is
+forgotten as the samples are that it came with, and float32 does not drift over a hundred thousand iterations.
 """
 
 import math
@@ -32,12 +33,12 @@ _SEEN = "seen_"
 
 @wp.struct
 class FilmData:
-    """Sums over iterations, one row per pixel."""
+    """Radiance, a mean over iterations, and what else there is, sums; one row per pixel."""
 
-    emission: wp.array[wp.vec3d]
-    direct: wp.array[wp.vec3d]  # light reflected once
-    indirect: wp.array[wp.vec3d]
-    squares: wp.array[wp.vec3d]  # of the sum of the three
+    emission: wp.array[wp.vec3]
+    direct: wp.array[wp.vec3]  # light reflected once
+    indirect: wp.array[wp.vec3]
+    deviation: wp.array[wp.vec3]  # standard deviation of the sum of the three
     albedo: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
     position: wp.array[wp.vec3]
@@ -53,8 +54,12 @@ def _finite(v: wp.vec3) -> bool:
 
 
 @wp.func
-def _double(v: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+def _deviation(old: float, x: float, mean: float, share: float) -> float:
+    """The standard deviation with a sample x more, which is so much of them all; `mean` is that of the others."""
+    d = wp.float64(x - mean)
+    w = wp.float64(share)
+    before = wp.float64(old)
+    return float(wp.sqrt((wp.float64(1.0) - w) * (before * before + w * d * d)))
 
 
 @wp.kernel
@@ -64,23 +69,32 @@ def _add(
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
     exposure: float,
-    is_first: int,
+    before: int,
     film: FilmData,
 ) -> None:
-    """Adds one iteration's estimate of every pixel."""
+    """Adds one iteration's estimate of every pixel to as many as there were before."""
     i = first + wp.tid()
     le = gbuffer.emission[i] * exposure
     once = wp.cw_mul(gbuffer.albedo[i], direct[i]) * exposure
     more = wp.cw_mul(gbuffer.albedo[i], indirect[i]) * exposure
-    total = le + once + more
-    if _finite(total):
-        film.emission[i] += _double(le)
-        film.direct[i] += _double(once)
-        film.indirect[i] += _double(more)
-        film.squares[i] += wp.cw_mul(_double(total), _double(total))
-    else:
+    if not _finite(le + once + more):
         film.rejected[i] += 1
-    if is_first == 1:
+        le = wp.vec3(0.0)
+        once = wp.vec3(0.0)
+        more = wp.vec3(0.0)
+    share = 1.0 / float(before + 1)
+    x = le + once + more
+    mean = film.emission[i] + film.direct[i] + film.indirect[i]
+    old = film.deviation[i]
+    film.deviation[i] = wp.vec3(
+        _deviation(old[0], x[0], mean[0], share),
+        _deviation(old[1], x[1], mean[1], share),
+        _deviation(old[2], x[2], mean[2], share),
+    )
+    film.emission[i] += (le - film.emission[i]) * share
+    film.direct[i] += (once - film.direct[i]) * share
+    film.indirect[i] += (more - film.indirect[i]) * share
+    if before == 0:
         film.mesh[i] = gbuffer.mesh[i]
     if gbuffer.mesh[i] >= 0:
         film.hits[i] += 1
@@ -88,6 +102,26 @@ def _add(
         film.normal[i] += gbuffer.shading_normal[i]
         film.position[i] += gbuffer.position[i]
         film.depth[i] += gbuffer.depth[i]
+
+
+@wp.kernel
+def _measure(
+    first: int, film: FilmData, columns: int, iterations: int, floor: wp.float64, out: wp.array[wp.vec2d]
+) -> None:
+    """Sums over a row of pixels: of the radiance L, and of its se² / (L² + floor)."""
+    row = first + wp.tid()
+    radiance = wp.float64(0.0)
+    error = wp.float64(0.0)
+    for i in range(row * columns, (row + 1) * columns):
+        mean = film.emission[i] + film.direct[i] + film.indirect[i]
+        for c in range(3):
+            x = wp.float64(mean[c])
+            s = wp.float64(film.deviation[i][c])
+            scale = x * x + floor
+            radiance += x
+            if scale > wp.float64(0.0):
+                error += s * s / (scale * wp.float64(iterations - 1))
+    out[row] = wp.vec2d(radiance, error)
 
 
 class Film:
@@ -118,9 +152,7 @@ class Film:
         self._launcher = launcher
         data = FilmData()
         pixels = width * height
-        for name in ("emission", "direct", "indirect", "squares"):
-            setattr(data, name, launcher.zeros(pixels, wp.vec3d))
-        for name in ("albedo", "normal", "position"):
+        for name in (*_RADIANCE, "deviation", "albedo", "normal", "position"):
             setattr(data, name, launcher.zeros(pixels, wp.vec3))
         data.depth = launcher.zeros(pixels, wp.float32)
         for name in ("hits", "rejected", "mesh"):
@@ -132,7 +164,7 @@ class Film:
         self._launcher.launch(
             _add,
             self.width * self.height,
-            [gbuffer, direct, indirect, exposure, int(self.iterations == 0), self._data],
+            [gbuffer, direct, indirect, exposure, self.iterations, self._data],
         )
         if self.reconstruction is not None:
             self.reconstruction.observe(gbuffer, direct, indirect)
@@ -146,10 +178,22 @@ class Film:
         """
         if (self.width, self.height) != (other.width, other.height):
             raise InputError(f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels")
+        if other.iterations == 0:
+            return
+        n, m = self.iterations, other.iterations
+        apart = (self._sum(*_RADIANCE) - other._sum(*_RADIANCE)).astype(np.float64).reshape(-1, 3)
         for name in FilmData.vars:
-            mine, theirs = getattr(self._data, name).numpy(), getattr(other._data, name).numpy()
-            if name != "mesh" or self.iterations == 0:
-                getattr(self._data, name).assign(mine + theirs)
+            mine, theirs = (getattr(film._data, name).numpy() for film in (self, other))
+            if name in _RADIANCE:
+                mine = np.average([mine, theirs], axis=0, weights=[n, m])
+            elif name == "deviation":
+                variance = np.average(np.square([mine, theirs], dtype=np.float64), axis=0, weights=[n, m])
+                mine = np.sqrt(variance + n * m * (apart / (n + m)) ** 2)
+            elif name != "mesh":
+                mine = mine + theirs
+            elif n == 0:
+                mine = theirs
+            getattr(self._data, name).assign(mine)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self.iterations += other.iterations
@@ -167,7 +211,7 @@ class Film:
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
             pictures.append(self._denoise())
         if not pictures:
-            pictures.append(self._mean(*_RADIANCE).astype(np.float32))
+            pictures.append(self._sum(*_RADIANCE))
         # What two unlike filters do wrong is hardly related: their mean has less error than the better of them.
         return np.asarray(sum(pictures) / np.float32(len(pictures)))
 
@@ -178,7 +222,7 @@ class Film:
                 if self.reconstruction is not None:
                     albedo, normal, noisy = self._reconstruct()[2:]
                 else:
-                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._mean(*_RADIANCE)
+                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._sum(*_RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
                 picture = denoise(noisy, albedo, normal, clean)
             self._denoised = (self.iterations, picture)
@@ -200,9 +244,7 @@ class Film:
         n = self.iterations
         if n < 2:
             return np.full((self.height, self.width, 3), np.inf, np.float32)
-        mean = self._mean(*_RADIANCE)
-        variance = np.maximum(self._mean("squares") - mean * mean, 0.0)
-        return np.sqrt(variance / (n - 1)).astype(np.float32)
+        return self._sum("deviation") / np.float32(math.sqrt(n - 1))
 
     def error(self) -> float:
         """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²), m the mean of L.
@@ -211,10 +253,15 @@ class Film:
         """
         if self.iterations < 2:
             return math.nan
-        mean = self._mean(*_RADIANCE)
-        scale = mean**2 + 0.01 * mean.mean() ** 2
-        squared = self.standard_error().astype(np.float64) ** 2
-        return float(np.sqrt(np.mean(np.divide(squared, scale, out=np.zeros_like(squared), where=scale > 0.0))))
+        values = 3 * self.width * self.height
+        mean = self._measure(0.0)[0] / values
+        return math.sqrt(self._measure(0.01 * mean**2)[1] / values)
+
+    def _measure(self, floor: float) -> Any:
+        """Sums over the picture: of the radiance L, and of its se² / (L² + floor)."""
+        rows = self._launcher.empty(self.height, wp.vec2d)
+        self._launcher.launch(_measure, self.height, [self._data, self.width, self.iterations, floor, rows])
+        return rows.numpy().sum(axis=0)
 
     def aov(self, name: str) -> Image:
         """One of `AOV_NAMES`.
@@ -232,9 +279,9 @@ class Film:
         if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 0:
             return self._reconstruct()[("direct", "indirect").index(name)]
         if name == "direct":
-            return self._mean("emission", "direct").astype(np.float32)
+            return self._sum("emission", "direct")
         if name == "indirect":
-            return self._mean("indirect").astype(np.float32)
+            return self._sum("indirect")
         if name == "prim_id":
             return self._data.mesh.numpy().reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
         hits = self._data.hits.numpy().reshape(shape)
@@ -310,10 +357,12 @@ class Film:
             getattr(film._data, name).assign(arrays[name])
         return film
 
-    def _mean(self, *names: str) -> npt.NDArray[np.float64]:
-        """The mean per iteration of the sum of some tables, float64 [height, width, 3]."""
-        total = np.sum([getattr(self._data, name).numpy() for name in names], axis=0)
-        return np.asarray(total / max(self.iterations, 1)).reshape(self.height, self.width, 3)
+    def _sum(self, *names: str) -> npt.NDArray[np.float32]:
+        """The sum of some tables, float32 [height, width, 3]; never a view of one."""
+        total = np.zeros((self.width * self.height, 3), np.float32)
+        for name in names:
+            total += getattr(self._data, name).numpy()
+        return total.reshape(self.height, self.width, 3)
 
 
 def _read(path: str | os.PathLike[str], names: Sequence[str]) -> dict[str, Any]:

@@ -177,12 +177,12 @@ class Renderer:
             while not film.interrupted and film.iterations < self.settings.iteration_limit:
                 try:
                     self.add_iteration(film, film.iterations)
+                    film.seconds = time.perf_counter() - start
+                    # Measuring the error may cost as much as a cheap iteration: do it every eighth part of the way.
+                    if film.iterations >= max(2, checked + checked // 8 + 1):
+                        checked, error = film.iterations, film.error()
                 except Cancelled:
                     break
-                film.seconds = time.perf_counter() - start
-                # Measuring the error costs as much as a cheap iteration: do it every eighth part of the way.
-                if film.iterations >= max(2, checked + checked // 8 + 1):
-                    checked, error = film.iterations, film.error()
                 looking = (self._primary_seconds() - looked) / (film.iterations - done)
                 reserve = 0.0 if film.reconstruction is None else looking * film.reconstruction.passes(film.iterations)
                 report = _progress(film, self.settings, error, reserve)

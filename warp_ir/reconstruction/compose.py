@@ -30,11 +30,6 @@ class Picture:
 
 
 @wp.func
-def _single(v: wp.vec3d) -> wp.vec3:
-    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
-
-
-@wp.func
 def _student(n: float) -> float:
     """What noise makes of (difference / standard error)² on average, the error being estimated from n samples."""
     return wp.where(n > 3.5, (n - 1.0) / wp.max(n - 3.0, 1.0), 1.0e30)
@@ -63,9 +58,9 @@ def _compose(
     p = first + wp.tid()
     surfaces = seen.surfaces
     n = float(out.iterations)
-    emitted = _single(film.emission[p]) / n
-    raw_direct = _single(film.direct[p]) / n
-    raw_indirect = _single(film.indirect[p]) / n
+    emitted = film.emission[p]
+    raw_direct = film.direct[p]
+    raw_indirect = film.indirect[p]
     albedo = film.albedo[p] / n
     normal = film.normal[p] / n
     plain = emitted + raw_direct + raw_indirect

@@ -21,7 +21,7 @@ def on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
     for k in range(9):
         q = pixel_around(surfaces, p, k)
         other = film.emission[q][0] + film.emission[q][1] + film.emission[q][2]
-        if wp.abs(other - glow) > wp.float64(0.01) * wp.max(other, glow) or differ(surfaces, p, q):
+        if wp.abs(other - glow) > 0.01 * wp.max(other, glow) or differ(surfaces, p, q):
             return True
     return False
 
