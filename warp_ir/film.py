@@ -54,12 +54,14 @@ def _finite(v: wp.vec3) -> bool:
 
 
 @wp.func
-def _deviation(old: float, x: float, mean: float, share: float) -> float:
-    """The standard deviation with a sample x more, which is so much of them all; `mean` is that of the others."""
-    d = wp.float64(x - mean)
-    w = wp.float64(share)
-    before = wp.float64(old)
-    return float(wp.sqrt((wp.float64(1.0) - w) * (before * before + w * d * d)))
+def _deviation(old: wp.vec3, off: wp.vec3, share: float) -> wp.vec3:
+    """The standard deviations when a sample is added which is so much of them all, and so far off their mean."""
+    # Squares are taken in a scale in which they neither overflow nor vanish.
+    scale = wp.max(wp.max(wp.max(old), wp.max(wp.abs(off))), 1.0e-37)
+    a = old * (1.0 / scale)
+    b = off * (1.0 / scale)
+    variance = (wp.cw_mul(a, a) + wp.cw_mul(b, b) * share) * (1.0 - share)
+    return wp.vec3(wp.sqrt(variance[0]), wp.sqrt(variance[1]), wp.sqrt(variance[2])) * scale
 
 
 @wp.kernel
@@ -83,14 +85,8 @@ def _add(
         once = wp.vec3(0.0)
         more = wp.vec3(0.0)
     share = 1.0 / float(before + 1)
-    x = le + once + more
-    mean = film.emission[i] + film.direct[i] + film.indirect[i]
-    old = film.deviation[i]
-    film.deviation[i] = wp.vec3(
-        _deviation(old[0], x[0], mean[0], share),
-        _deviation(old[1], x[1], mean[1], share),
-        _deviation(old[2], x[2], mean[2], share),
-    )
+    off = le + once + more - (film.emission[i] + film.direct[i] + film.indirect[i])
+    film.deviation[i] = _deviation(film.deviation[i], off, share)
     film.emission[i] += (le - film.emission[i]) * share
     film.direct[i] += (once - film.direct[i]) * share
     film.indirect[i] += (more - film.indirect[i]) * share
