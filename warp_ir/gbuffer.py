@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, carve, floats
 from warp_ir.lights import lights_found, surface_seen
 from warp_ir.surface import albedo, closest, mapped_normal, shading_normal, smooth_rise
 
@@ -177,15 +177,23 @@ def _trace_primary(
     gbuffer.depth[pixel] = sight.depth
 
 
-def new_gbuffer(launcher: Launcher, pixels: int, mapped: bool) -> Any:
-    """An uninitialised `GBuffer`, of a scene with normal maps or without."""
+def new_gbuffer(launcher: Launcher, pixels: int, mapped: bool, spare: int = 0) -> tuple[Any, Any, Any, Any]:
+    """What an iteration fills in: a `GBuffer` of a scene with normal maps or without, and two irradiances over π.
+
+    The first of these takes the place of `normal`, which nothing needs afterwards. The last is the block of float32
+    that all of it lies in, `spare` a pixel at least: scratch while no iteration is in work.
+    """
+    vectors = ["position", "normal", "shading_normal", "albedo", "emission", *(["smooth_normal"] if mapped else [])]
+    types = [*[wp.vec3] * (len(vectors) + 1), wp.int32, wp.float32]
+    block = launcher.empty(pixels * max(floats(*types), spare), wp.float32)
+    *arrays, indirect, mesh, depth = carve(block, pixels, types)
     gbuffer = GBuffer()
-    gbuffer.mesh = launcher.empty(pixels, wp.int32)
-    for name in ("position", "normal", "shading_normal", "albedo", "emission"):
-        setattr(gbuffer, name, launcher.empty(pixels, wp.vec3))
-    gbuffer.smooth_normal = launcher.empty(pixels, wp.vec3) if mapped else gbuffer.shading_normal
-    gbuffer.depth = launcher.empty(pixels, wp.float32)
-    return gbuffer
+    gbuffer.mesh, gbuffer.depth = mesh, depth
+    for name, array in zip(vectors, arrays, strict=True):
+        setattr(gbuffer, name, array)
+    if not mapped:
+        gbuffer.smooth_normal = gbuffer.shading_normal
+    return gbuffer, gbuffer.normal, indirect, block
 
 
 def trace_primary(

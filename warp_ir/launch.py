@@ -278,6 +278,21 @@ class Launcher:
         return wp.array(data, dtype=dtype, device=self.device)
 
 
+def carve(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
+    """Arrays of so many rows of each type, one after the other in a block of float32: memory that is used twice."""
+    arrays, begin = [], 0
+    for dtype in dtypes:
+        end = begin + rows * floats(dtype)
+        arrays.append(block[begin:end].reshape((rows, -1) if floats(dtype) > 1 else rows).view(dtype))
+        begin = end
+    return arrays
+
+
+def floats(*dtypes: Any) -> int:
+    """How many float32 a row of these types takes."""
+    return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes) // 4
+
+
 def _usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -40,7 +40,7 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
-from warp_ir.reconstruction import Reconstruction
+from warp_ir.reconstruction import SCRATCH, Reconstruction
 from warp_ir.sampling import iteration_scramble
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
@@ -122,8 +122,9 @@ class Renderer:
         pixels = camera.columns * camera.rows
         mapped = any(data.data.normal_map_count > 0 for data in uploaded)
         if self._gbuffer is None or (self._gbuffer.mesh.shape[0], self._mapped) != (pixels, mapped):
-            self._gbuffer, self._mapped = new_gbuffer(launcher, pixels, mapped), mapped
-            self._direct, self._indirect = launcher.empty(pixels, wp.vec3), launcher.empty(pixels, wp.vec3)
+            buffers = new_gbuffer(launcher, pixels, mapped, SCRATCH if settings.filter else 0)
+            self._gbuffer, self._direct, self._indirect, self._block = buffers
+            self._mapped = mapped
 
     def _check_memory(self) -> None:
         _, _, columns, rows = self.settings.pixels()
@@ -146,7 +147,7 @@ class Renderer:
         film.settings = self.settings
         if self.settings.filter and self.settings.estimator == "vpl":
             film.reconstruction = Reconstruction(
-                first.scene, first.camera, self.launcher, self._gbuffer, first.exposure, self.settings.seed
+                first.scene, first.camera, self.launcher, self._gbuffer, self._block, first.exposure, self.settings.seed
             )
         return film
 

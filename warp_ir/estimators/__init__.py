@@ -23,7 +23,10 @@ class Estimator(Protocol):
         """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
+        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration.
+
+        `direct` lies where `gbuffer.normal` does: a pixel's normal is to be read before its light is written.
+        """
 
 
 ESTIMATORS: dict[str, type[Estimator]] = {"vpl": VplGatherer, "keller": Keller, "path": PathTracer}

@@ -13,6 +13,6 @@ noise. On edges a part of the difference is given back, as much of it as is not 
 (`compose.py`).
 """
 
-from warp_ir.reconstruction.reconstruct import Reconstruction
+from warp_ir.reconstruction.reconstruct import SCRATCH, Reconstruction
 
-__all__ = ["Reconstruction"]
+__all__ = ["SCRATCH", "Reconstruction"]

@@ -112,17 +112,16 @@ def _normalized(sum: wp.vec4, weight: float) -> wp.vec4:
     return wp.vec4(sum[0] * k, sum[1] * k, sum[2] * k, sum[3] * k * k)
 
 
-def new_layer(pixels: int, launcher: Launcher) -> Any:
-    """An uninitialised `Layer`."""
+def new_layer(direct: Any, indirect: Any) -> Any:
+    """A `Layer` of two arrays."""
     layer = Layer()
-    layer.direct, layer.indirect = launcher.empty(pixels, wp.vec4), launcher.empty(pixels, wp.vec4)
+    layer.direct, layer.indirect = direct, indirect
     return layer
 
 
-def filter_layer(surfaces: Any, layer: Any, launcher: Launcher) -> tuple[Any, Any]:
-    """The filtered `Layer`, and one to be overwritten; the given one is used up."""
+def filter_layer(surfaces: Any, layer: Any, other: Any, launcher: Launcher) -> tuple[Any, Any]:
+    """The filtered `Layer`, and one to be overwritten: both given ones are used up."""
     pixels = surfaces.columns * surfaces.rows
-    other = new_layer(pixels, launcher)
     for level in range(LEVELS):
         launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level, _SIGMA * _NARROW**level])
         layer, other = other, layer

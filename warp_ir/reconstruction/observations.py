@@ -7,7 +7,7 @@ import warp as wp
 from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.launch import Launcher
-from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, new_layer
+from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
 from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -25,7 +25,7 @@ class Observations:
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the two mean channels
     count: wp.array[wp.int32]
-    noise: wp.array[wp.vec2]  # variance of one sample of the two mean channels; worked out when the picture is made
+    noise: wp.array[wp.vec2]  # variance of one sample of the two mean channels; there while the picture is made
     other_direct: wp.array[wp.vec3]  # on surfaces that neither the pixel's centre shows nor a neighbour's
     other_indirect: wp.array[wp.vec3]
     other_count: wp.array[wp.int32]
@@ -115,6 +115,7 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
     n = float(seen.count[p])
     out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    seen.noise[p] = wp.vec2(0.0)
     if n > 0.0:
         direct = seen.direct[p] / n
         indirect = seen.indirect[p] / n
@@ -172,7 +173,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed
     seen.surfaces = surfaces
     for name in ("direct", "indirect", "other_direct", "other_indirect"):
         setattr(seen, name, launcher.zeros(pixels, wp.vec3))
-    seen.squares, seen.noise = launcher.zeros(pixels, wp.vec2), launcher.zeros(pixels, wp.vec2)
+    seen.squares = launcher.zeros(pixels, wp.vec2)
     seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
     seen.seed = wp.uint32(seed)
     return seen, float(gbuffer.mesh.numpy().mean())
@@ -188,12 +189,12 @@ def observe(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launc
     launcher.launch(_observe, gbuffer.mesh.shape[0], [gbuffer, direct, indirect, seen])
 
 
-def average(seen: Any, launcher: Launcher) -> Any:
-    """The means of `Observations` as a `Layer`; their noise is noted in it."""
-    pixels = seen.count.shape[0]
-    layer = new_layer(pixels, launcher)
-    launcher.launch(_average, pixels, [seen.surfaces, seen, layer])
-    return layer
+def average(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
+    """Fills a `Layer` with the means of `Observations`, and gives these back with their `noise`, which it fills too."""
+    seen = _copy(Observations, seen)
+    seen.noise = noise
+    launcher.launch(_average, seen.count.shape[0], [seen.surfaces, seen, layer])
+    return seen
 
 
 def without_mixed(seen: Any, layer: Any, iterations: int, launcher: Launcher) -> Any:
