@@ -200,16 +200,16 @@ class Film:
 
         The mean of the iterations, its noise filtered or denoised if the settings say so.
         """
-        pictures = []
+        pictures: list[Image] = []
         if self.reconstruction is not None and self.iterations > 0:
             direct, indirect = self._reconstruct()[:2]
             pictures.append(direct + indirect)
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
-            pictures.append(self._denoise())
+            pictures.append(self._denoise().copy())
         if not pictures:
-            pictures.append(self._sum(*_RADIANCE))
+            return self._sum(*_RADIANCE)
         # What two unlike filters do wrong is hardly related: their mean has less error than the better of them.
-        return np.asarray(sum(pictures) / np.float32(len(pictures)))
+        return np.asarray(np.mean(pictures, axis=0)) if len(pictures) > 1 else pictures[0]
 
     def _denoise(self) -> npt.NDArray[np.float32]:
         """The denoised mean, computed once per iteration."""
