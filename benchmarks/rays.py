@@ -176,7 +176,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     uploaded = upload_scene(scene, launcher)
     settings = ir.RenderSettings(width=width, height=width)
     camera = camera_data(scene.camera, uploaded.frame, settings)
-    gbuffer, *_ = new_gbuffer(launcher, width * width, uploaded.data.normal_map_count > 0)
+    gbuffer, *_ = new_gbuffer(launcher, width * width, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
         uploaded, launcher, paths=PATHS, absorption="roulette", max_bounces=settings.bounce_limit, scramble=1

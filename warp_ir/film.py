@@ -35,7 +35,7 @@ _SEEN = "seen_"
 class FilmData:
     """Radiance, a mean over iterations, and what else there is, sums; one row per pixel."""
 
-    emission: wp.array[wp.vec3]
+    emission: wp.array[wp.vec3]  # empty if there can be none
     direct: wp.array[wp.vec3]  # light reflected once
     indirect: wp.array[wp.vec3]
     deviation: wp.array[wp.vec3]  # standard deviation of the sum of the three
@@ -64,6 +64,14 @@ def _deviation(old: wp.vec3, off: wp.vec3, share: float) -> wp.vec3:
     return wp.vec3(wp.sqrt(variance[0]), wp.sqrt(variance[1]), wp.sqrt(variance[2])) * scale
 
 
+@wp.func
+def emission_of(film: FilmData, i: int) -> wp.vec3:
+    """Radiance that reaches the camera without reflection."""
+    if film.emission.shape[0] > 0:
+        return film.emission[i]
+    return wp.vec3(0.0)
+
+
 @wp.kernel
 def _add(
     first: int,
@@ -76,7 +84,9 @@ def _add(
 ) -> None:
     """Adds one iteration's estimate of every pixel to as many as there were before."""
     i = first + wp.tid()
-    le = gbuffer.emission[i] * exposure
+    le = wp.vec3(0.0)
+    if film.emission.shape[0] > 0:
+        le = gbuffer.emission[i] * exposure
     once = wp.cw_mul(gbuffer.albedo[i], direct[i]) * exposure
     more = wp.cw_mul(gbuffer.albedo[i], indirect[i]) * exposure
     if not _finite(le + once + more):
@@ -85,9 +95,10 @@ def _add(
         once = wp.vec3(0.0)
         more = wp.vec3(0.0)
     share = 1.0 / float(before + 1)
-    off = le + once + more - (film.emission[i] + film.direct[i] + film.indirect[i])
+    off = le + once + more - (emission_of(film, i) + film.direct[i] + film.indirect[i])
     film.deviation[i] = _deviation(film.deviation[i], off, share)
-    film.emission[i] += (le - film.emission[i]) * share
+    if film.emission.shape[0] > 0:
+        film.emission[i] += (le - film.emission[i]) * share
     film.direct[i] += (once - film.direct[i]) * share
     film.indirect[i] += (more - film.indirect[i]) * share
     if before == 0:
@@ -109,7 +120,7 @@ def _measure(
     radiance = wp.float64(0.0)
     error = wp.float64(0.0)
     for i in range(row * columns, (row + 1) * columns):
-        mean = film.emission[i] + film.direct[i] + film.indirect[i]
+        mean = emission_of(film, i) + film.direct[i] + film.indirect[i]
         for c in range(3):
             x = wp.float64(mean[c])
             s = wp.float64(film.deviation[i][c])
@@ -125,8 +136,11 @@ class Film:
 
     AOV_NAMES = AOV_NAMES
 
-    def __init__(self, width: int, height: int, launcher: Launcher, frame: Any = None) -> None:
-        """An empty film on the launcher's device; `frame` (a `DeviceFrame`) takes positions back to the world."""
+    def __init__(self, width: int, height: int, launcher: Launcher, frame: Any = None, *, glows: bool = True) -> None:
+        """An empty film on the launcher's device.
+
+        `frame` (a `DeviceFrame`) takes positions back to the world; `glows` says whether anything in view may emit.
+        """
         self.width, self.height = width, height
         self.iterations = 0
         """Iterations added."""
@@ -149,7 +163,7 @@ class Film:
         data = FilmData()
         pixels = width * height
         for name in (*_RADIANCE, "deviation", "albedo", "normal", "position"):
-            setattr(data, name, launcher.zeros(pixels, wp.vec3))
+            setattr(data, name, launcher.zeros(pixels if glows or name != "emission" else 0, wp.vec3))
         data.depth = launcher.zeros(pixels, wp.float32)
         for name in ("hits", "rejected", "mesh"):
             setattr(data, name, launcher.zeros(pixels, wp.int32))
@@ -347,7 +361,8 @@ class Film:
 
         arrays = _read(path, [*FilmData.vars, "size", "seconds", "origin", "scale"])
         width, height, iterations = (int(x) for x in arrays["size"])
-        film = Film(width, height, Launcher(device), DeviceFrame(arrays["origin"], float(arrays["scale"])))
+        frame = DeviceFrame(arrays["origin"], float(arrays["scale"]))
+        film = Film(width, height, Launcher(device), frame, glows=len(arrays["emission"]) > 0)
         film.iterations, film.seconds = iterations, float(arrays["seconds"])
         for name in FilmData.vars:
             getattr(film._data, name).assign(arrays[name])
@@ -357,7 +372,8 @@ class Film:
         """The sum of some tables, float32 [height, width, 3]; never a view of one."""
         total = np.zeros((self.width * self.height, 3), np.float32)
         for name in names:
-            total += getattr(self._data, name).numpy()
+            if name != "emission" or self._data.emission.shape[0] > 0:
+                total += getattr(self._data, name).numpy()
         return total.reshape(self.height, self.width, 3)
 
 

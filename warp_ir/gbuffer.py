@@ -31,7 +31,7 @@ class GBuffer:
     shading_normal: wp.array[wp.vec3]
     smooth_normal: wp.array[wp.vec3]  # the same without normal maps: by it surfaces are told apart
     albedo: wp.array[wp.vec3]
-    emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection
+    emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection; empty: there can be none
     depth: wp.array[wp.float32]  # along the camera's -Z
 
 
@@ -173,17 +173,22 @@ def _trace_primary(
     gbuffer.smooth_normal[pixel] = sight.smooth_normal
     gbuffer.shading_normal[pixel] = sight.shading_normal  # the same array, if there are no maps
     gbuffer.albedo[pixel] = sight.albedo
-    gbuffer.emission[pixel] = sight.emission
+    if gbuffer.emission.shape[0] > 0:
+        gbuffer.emission[pixel] = sight.emission
     gbuffer.depth[pixel] = sight.depth
 
 
-def new_gbuffer(launcher: Launcher, pixels: int, mapped: bool, spare: int = 0) -> tuple[Any, Any, Any, Any]:
-    """What an iteration fills in: a `GBuffer` of a scene with normal maps or without, and two irradiances over π.
+def new_gbuffer(
+    launcher: Launcher, pixels: int, *, mapped: bool, glows: bool, spare: int = 0
+) -> tuple[Any, Any, Any, Any]:
+    """What an iteration fills in: a `GBuffer`, and two irradiances over π.
 
-    The first of these takes the place of `normal`, which nothing needs afterwards. The last is the block of float32
-    that all of it lies in, `spare` a pixel at least: scratch while no iteration is in work.
+    `mapped` says whether the scene has normal maps, `glows` whether the camera may see what emits. The first irradiance
+    takes the place of `normal`, which nothing needs afterwards. The last is the block of float32 that all of it lies
+    in, `spare` a pixel at least: scratch while no iteration is in work.
     """
-    vectors = ["position", "normal", "shading_normal", "albedo", "emission", *(["smooth_normal"] if mapped else [])]
+    vectors = ["position", "normal", "shading_normal", "albedo"]
+    vectors += ["smooth_normal"] * mapped + ["emission"] * glows
     types = [*[wp.vec3] * (len(vectors) + 1), wp.int32, wp.float32]
     block = launcher.empty(pixels * max(floats(*types), spare), wp.float32)
     *arrays, indirect, mesh, depth = carve(block, pixels, types)
@@ -191,6 +196,8 @@ def new_gbuffer(launcher: Launcher, pixels: int, mapped: bool, spare: int = 0) -
     gbuffer.mesh, gbuffer.depth = mesh, depth
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)
+    if not glows:
+        gbuffer.emission = launcher.empty(0, wp.vec3)
     if not mapped:
         gbuffer.smooth_normal = gbuffer.shading_normal
     return gbuffer, gbuffer.normal, indirect, block

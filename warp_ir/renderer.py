@@ -90,8 +90,7 @@ class Renderer:
         self._check_memory()
         self.launcher.load(_modules(settings.estimator, self.launcher))
         self._moments: list[_Moment] = []
-        self._gbuffer: Any = None
-        self._mapped = False
+        self._needs: dict[str, Any] = {}  # of the buffers
         self._take(scene)
 
     def update(self, scene: Scene) -> None:
@@ -120,11 +119,15 @@ class Renderer:
             estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
             self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
         pixels = camera.columns * camera.rows
-        mapped = any(data.data.normal_map_count > 0 for data in uploaded)
-        if self._gbuffer is None or (self._gbuffer.mesh.shape[0], self._mapped) != (pixels, mapped):
-            buffers = new_gbuffer(launcher, pixels, mapped, SCRATCH if settings.filter else 0)
-            self._gbuffer, self._direct, self._indirect, self._block = buffers
-            self._mapped = mapped
+        needs = {
+            "pixels": pixels,
+            "mapped": any(data.data.normal_map_count > 0 for data in uploaded),
+            "glows": settings.visible_lights or any(_glows(moment) for moment in scenes),
+            "spare": SCRATCH if settings.filter else 0,
+        }
+        if self._needs != needs:
+            self._gbuffer, self._direct, self._indirect, self._block = new_gbuffer(launcher, **needs)
+            self._needs = needs
 
     def _check_memory(self) -> None:
         _, _, columns, rows = self.settings.pixels()
@@ -143,7 +146,8 @@ class Renderer:
     def new_film(self) -> Film:
         """An empty film of the right size."""
         first = self._moments[0]
-        film = Film(first.camera.columns, first.camera.rows, self.launcher, first.scene.frame)
+        size = first.camera.columns, first.camera.rows
+        film = Film(*size, self.launcher, first.scene.frame, glows=self._needs["glows"])
         film.settings = self.settings
         if self.settings.filter and self.settings.estimator == "vpl":
             film.reconstruction = Reconstruction(
@@ -234,6 +238,11 @@ def render(
     """
     renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
     return renderer.render(progress=progress)
+
+
+def _glows(scene: Scene) -> bool:
+    """Whether the camera may see a surface that emits."""
+    return any(max(material.emission) > 0.0 or material.glow is not None for material in scene.materials)
 
 
 def _with_height(settings: RenderSettings, scene: Scene) -> RenderSettings:

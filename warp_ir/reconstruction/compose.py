@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.film import FilmData
+from warp_ir.film import FilmData, emission_of
 from warp_ir.launch import Launcher
 from warp_ir.reconstruction.edges import Lit, look_closely, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
@@ -58,7 +58,7 @@ def _compose(
     p = first + wp.tid()
     surfaces = seen.surfaces
     n = float(out.iterations)
-    emitted = film.emission[p]
+    emitted = emission_of(film, p)
     raw_direct = film.direct[p]
     raw_indirect = film.indirect[p]
     albedo = film.albedo[p] / n

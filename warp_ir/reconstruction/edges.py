@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import CameraData, SceneData
-from warp_ir.film import FilmData
+from warp_ir.film import FilmData, emission_of
 from warp_ir.gbuffer import Sight, camera_ray, jitter, see
 from warp_ir.reconstruction.filter import Layer, mean_channel, value
 from warp_ir.reconstruction.observations import Observations
@@ -17,10 +17,12 @@ _PROBES = wp.constant(8)  # rays, to see whether the edge is in the pixel
 @wp.func
 def on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
     """Whether any of the eight neighbours shows another surface, or none, or one that emits differently."""
-    glow = film.emission[p][0] + film.emission[p][1] + film.emission[p][2]
+    here = emission_of(film, p)
+    glow = here[0] + here[1] + here[2]
     for k in range(9):
         q = pixel_around(surfaces, p, k)
-        other = film.emission[q][0] + film.emission[q][1] + film.emission[q][2]
+        there = emission_of(film, q)
+        other = there[0] + there[1] + there[2]
         if wp.abs(other - glow) > 0.01 * wp.max(other, glow) or differ(surfaces, p, q):
             return True
     return False
