@@ -16,7 +16,8 @@ PACKAGE = Path(ir.__file__).parent
 LAYERS = [
     ["placing", "color_space"],
     ["scene"],
-    ["settings", "tonemap", "metrics", "denoise", "mipmap", "cost"],
+    ["settings", "tonemap", "metrics", "denoise", "mipmap"],
+    ["cost"],
     ["profiling"],
     ["launch"],
     ["sampling"],

@@ -12,18 +12,19 @@ import warp_ir as ir
 from tests.physics.closed_form import placed
 from tests.physics.test_light_control import DOWN, everything, lamp_profile
 from warp_ir.cli import main
-from warp_ir.cost import scene_bytes
+from warp_ir.cost import pixel_bytes, scene_bytes
 from warp_ir.device_scene import upload_moments
 from warp_ir.launch import Launcher
 from warp_ir.procedural import cornell_box, furnace, mesh, sphere
+from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind, Shaping
 
 
 class Counting(Launcher):
     """Remembers every array that is made."""
 
-    def __init__(self):
-        super().__init__("cpu")
+    def __init__(self, device="cpu", threads=None):
+        super().__init__(device, threads)
         self._made = []
 
     def _seen(self, array):
@@ -116,6 +117,29 @@ def test_the_estimate_is_good_to_a_fifth(scene):
     uploaded = upload_moments(scene.shutter or (scene,), launcher)
     assert sum(scene_bytes(scene).values()) == pytest.approx(launcher.alive(), rel=0.2)
     del uploaded
+
+
+def mapped():
+    normals = ir.Texture("n", np.full((4, 4, 3), (0.0, 0.0, 1.0)))
+    return ir.Scene(furnace(level=1).meshes, (ir.Material("m", normal_texture=normals),))
+
+
+@pytest.mark.parametrize("scene", [cornell_box(), lamps(), mapped()], ids=["glows", "lamps", "mapped"])
+@pytest.mark.parametrize("settings", [{}, {"filter": False}, {"estimator": "path"}, {"visible_lights": True}], ids=str)
+def test_what_a_pixel_takes(scene, settings, monkeypatch):
+    """By as many bytes a pixel all arrays grow with the picture, once two iterations and a picture have been made."""
+    monkeypatch.setattr("warp_ir.renderer.Launcher", Counting)
+    alive = []
+    for width in (16, 48):
+        renderer = Renderer(scene, ir.RenderSettings(width=width, height=width, light_paths=16, **settings))
+        film = renderer.new_film()
+        for iteration in range(2):
+            renderer.add_iteration(film, iteration)
+        picture = film.radiance()
+        film.error()
+        alive.append(renderer.launcher.alive() + picture.nbytes)
+    said = pixel_bytes(scene, renderer.settings)
+    assert (alive[1] - alive[0]) / (48**2 - 16**2) == pytest.approx(said, rel=0.01)
 
 
 LAMP = """#usda 1.0

@@ -1,4 +1,4 @@
-"""What a scene costs, before it is uploaded."""
+"""What a scene costs, before it is uploaded, and a picture."""
 
 from collections.abc import Iterator
 
@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ir.scene import Instances, Light, Mesh, MeshLight, Scene
+from warp_ir.settings import RenderSettings
 
 # Bytes on the device, measured on the CPU; a GPU takes about as many.
 _BASE = 7500  # sequences, and a row of each table that is empty
@@ -22,6 +23,27 @@ _CHAIN = 4.0 / 3.0  # of an image with all that is made smaller of it
 _MOST_TEXELS = 2**30  # bytes to which textures are averaged down: `texture.MAX_BYTES`
 _SKY = 16  # of a texel of a light: three floats, and its probability
 _SHAPED = 8200  # directions of photons
+
+# Bytes of a pixel: twelve are a colour, a place or a direction.
+_COLOR = 12
+_FILM = 88
+_ITERATION = 68  # what the camera sees, and the light there
+_OBSERVED = 92  # by the filter, beside the film
+_LAYERS = 72  # where an iteration lay: two images and their noise
+_FILTERED = 24
+_DENOISER = 100  # about; what it takes for itself is not in it
+
+
+def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
+    """How much memory a pixel takes where the scene is rendered, with its picture on the host."""
+    mapped = any(material.normal_texture is not None for material in scene.materials)
+    glows = scene.glows or settings.visible_lights
+    iteration = _ITERATION + _COLOR * (glows + mapped)
+    total = _FILM + _COLOR * glows + _COLOR
+    if settings.filters:
+        iteration = max(iteration, _LAYERS)
+        total += _OBSERVED + _FILTERED
+    return total + iteration + _DENOISER * settings.denoise
 
 
 def scene_bytes(scene: Scene) -> dict[str, int]:

@@ -34,6 +34,7 @@ import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
 import warp_ir.reconstruction.observations
 import warp_ir.vpl
+from warp_ir.cost import pixel_bytes
 from warp_ir.denoise import require_denoiser
 from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
 from warp_ir.estimators import ESTIMATORS
@@ -45,9 +46,6 @@ from warp_ir.sampling import iteration_scramble
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl import Vpls, emit_vpls, to_host
-
-_BYTES_PER_PIXEL = 400
-"""Film, G-buffer and filter, with a margin; `benchmarks/scaling.py` measures it."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class Renderer:
         if settings.denoise:
             require_denoiser()  # before the work, not after it
         self.launcher = Launcher(device, threads)
-        self._check_memory()
+        self._check_memory(scene)
         self.launcher.load(_modules(settings.estimator, self.launcher))
         self._moments: list[_Moment] = []
         self._needs: dict[str, Any] = {}  # of the buffers
@@ -103,7 +101,7 @@ class Renderer:
         """
         self.launcher.profile.clear()
         self.settings = _with_height(self.wanted, scene)
-        self._check_memory()
+        self._check_memory(scene)
         self._take(scene)
 
     def _take(self, scene: Scene) -> None:
@@ -122,16 +120,16 @@ class Renderer:
         needs = {
             "pixels": pixels,
             "mapped": any(data.data.normal_map_count > 0 for data in uploaded),
-            "glows": settings.visible_lights or any(_glows(moment) for moment in scenes),
-            "spare": SCRATCH if settings.filter else 0,
+            "glows": settings.visible_lights or any(moment.glows for moment in scenes),
+            "spare": SCRATCH if settings.filters else 0,
         }
         if self._needs != needs:
             self._gbuffer, self._direct, self._indirect, self._block = new_gbuffer(launcher, **needs)
             self._needs = needs
 
-    def _check_memory(self) -> None:
+    def _check_memory(self, scene: Scene) -> None:
         _, _, columns, rows = self.settings.pixels()
-        needed, there = columns * rows * _BYTES_PER_PIXEL, self.launcher.memory()
+        needed, there = columns * rows * pixel_bytes(scene, self.settings), self.launcher.memory()
         if needed > there:
             raise InputError(
                 f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
@@ -149,7 +147,7 @@ class Renderer:
         size = first.camera.columns, first.camera.rows
         film = Film(*size, self.launcher, first.scene.frame, glows=self._needs["glows"])
         film.settings = self.settings
-        if self.settings.filter and self.settings.estimator == "vpl":
+        if self.settings.filters:
             film.reconstruction = Reconstruction(
                 first.scene, first.camera, self.launcher, self._gbuffer, self._block, first.exposure, self.settings.seed
             )
@@ -238,11 +236,6 @@ def render(
     """
     renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
     return renderer.render(progress=progress)
-
-
-def _glows(scene: Scene) -> bool:
-    """Whether the camera may see a surface that emits."""
-    return any(max(material.emission) > 0.0 or material.glow is not None for material in scene.materials)
 
 
 def _with_height(settings: RenderSettings, scene: Scene) -> RenderSettings:

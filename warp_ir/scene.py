@@ -362,6 +362,11 @@ class Scene:
     """
 
     @property
+    def glows(self) -> bool:
+        """Whether any surface emits, or looks as if it did."""
+        return any(max(material.emission) > 0.0 or material.glow is not None for material in self.materials)
+
+    @property
     def triangle_count(self) -> int:
         """Number of triangles over all meshes: what is stored."""
         return sum(len(mesh.triangles) for mesh in self.meshes)

@@ -132,6 +132,11 @@ class RenderSettings:
         return 512 if self.estimator == "keller" else 1 << (min(max(pixels // 8, 1024), 4096).bit_length() - 1)
 
     @property
+    def filters(self) -> bool:
+        """Whether the noise is filtered: as set, if the estimator is one whose noise can be."""
+        return self.filter and self.estimator == "vpl"
+
+    @property
     def path_end(self) -> str:
         """The absorption that holds: as set; else fractional for `keller`, as published, roulette otherwise."""
         return self.absorption or ("fractional" if self.estimator == "keller" else "roulette")
