@@ -48,7 +48,7 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
     wp.compile_aot_module(module, arch=arch, module_dir=tmp_path, use_ptx=False)
     (cubin,) = tmp_path.glob("*.cubin")
     used = resources(cubin)
-    assert len(used) == sum("wp.kernel" in ast.unparse(d) for d in decorators(module))
+    assert len(used) == sum(name == module.__name__ for m in KERNEL_MODULES for name in compiled_with(m))
     traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
     for name, (registers, local) in used.items():
         if traces_rays and local > _MOST_LOCAL:
@@ -61,10 +61,13 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
             assert local <= _MOST_LOCAL, f"{name}: {local} bytes of local memory"
 
 
-def decorators(module):
-    """Those of the functions of a module."""
+def compiled_with(module):
+    """For every kernel in a file, the module that it is compiled with: its own, unless the decorator names another."""
     for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
-        yield from getattr(node, "decorator_list", ())
+        for decorator in getattr(node, "decorator_list", ()):
+            if "wp.kernel" in ast.unparse(decorator):
+                named = {k.arg: k.value for k in getattr(decorator, "keywords", ())}
+                yield named["module"].value if "module" in named else module.__name__
 
 
 def test_resources_are_read(tmp_path):

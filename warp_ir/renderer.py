@@ -271,20 +271,21 @@ def trace_vpls(
 
 def _modules(estimator: str, launcher: Launcher) -> list[Any]:
     """What has kernels that an estimator needs, those that take longest to compile first."""
-    common = [warp_ir.gbuffer, *([warp_ir.bvh.build] if launcher.device.is_cpu else []), warp_ir.film]
+    common = [*([warp_ir.bvh.build] if launcher.device.is_cpu else []), warp_ir.film]
     if estimator == "vpl":
         return [
-            warp_ir.reconstruction.compose,
+            warp_ir.gbuffer,
             warp_ir.estimators.vpl,
             warp_ir.vpl,
+            warp_ir.reconstruction.compose,
             *common,
             warp_ir.gather,
             warp_ir.reconstruction.observations,
             warp_ir.reconstruction.filter,
         ]
     if estimator == "keller":
-        return [warp_ir.vpl, warp_ir.estimators.keller, *common]
-    return [warp_ir.estimators.path, *common]
+        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller, *common]
+    return [warp_ir.gbuffer, warp_ir.estimators.path, *common]
 
 
 def _progress(film: Film, settings: RenderSettings, error: float, reserve: float) -> Progress:

@@ -43,7 +43,7 @@ def _give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
     return difference / (1.0 + ratio * ratio)
 
 
-@wp.kernel
+@wp.kernel(module="warp_ir.gbuffer")  # so that camera rays are compiled once
 def _compose(
     first: int,
     scene: SceneData,
