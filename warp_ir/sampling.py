@@ -120,8 +120,8 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
     x = wp.uint32(0)
     column = 32 * d
     while i != wp.uint32(0):
-        if (i & wp.uint32(1)) != wp.uint32(0):
-            x = x ^ matrices[column]
+        # No branch on bits that nobody can predict.
+        x = x ^ (matrices[column] & (wp.uint32(0) - (i & wp.uint32(1))))
         i = i >> wp.uint32(1)
         column += 1
     x = _reverse_bits(_permute_reversed(x, _seed(scramble, wp.uint32(dimension))))
