@@ -59,6 +59,7 @@ class VplSets:
     shaped: int  # 1: there are rows of shaping
     shapes: wp.array[vec16]
     order: wp.array[wp.int32]  # their rows in `vpls`, set by set and in each along a space-filling curve
+    colors: wp.array[wp.vec4]  # intensity and bounce in that order: what is looked up at random lies close together
     vpls: VplBuffer
 
 
@@ -165,21 +166,30 @@ def _sum(v: vec16) -> float: ...
 
 
 @wp.func
-def _shadowed(scene: SceneData, lit: VplSets, x: Receiver, slot: int, share: float, max_bounce: int) -> wp.vec3:
-    """What the chosen VPL gives: `share` (= S/M) in the colour of its intensity, if it is visible."""
-    if slot < lit.count:
+def _color_of(lit: VplSets, slot: int) -> wp.vec4:
+    """Intensity and bounce."""
+    vpl = lit.order[slot]
+    intensity = lit.vpls.intensity[vpl]
+    return wp.vec4(intensity[0], intensity[1], intensity[2], float(lit.vpls.bounce[vpl]))
+
+
+@wp.func
+def _shadowed(
+    scene: SceneData, lit: VplSets, x: Receiver, slot: int, position: wp.vec4, color: wp.vec4, share: float, most: int
+) -> wp.vec3:
+    """What the chosen VPL gives: `share` (= S/M) in its `color`, if it is visible and of at most `most` bounces."""
+    if int(color[3]) > most:
+        return wp.vec3(0.0)
+    control = int(-1)
+    if scene.control_count > 0:
         vpl = lit.order[slot]
-        if lit.vpls.bounce[vpl] <= max_bounce:
-            control = int(-1)
-            if scene.control_count > 0 and vpl < lit.vpls.on_lights:
-                control = lit.vpls.control[vpl]
-            arrives = arriving(scene, control, x.position, x.mesh, x.seen, lit.vpls.position[vpl])
-            if control >= 0:  # it was weighed with this factor
-                shape = scene.light_tables[0].controls.rows[control]
-                arrives = arrives / emphasis(shape, x.position, lit.vpls.position[vpl])
-            intensity = lit.vpls.intensity[vpl]
-            return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
-    return wp.vec3(0.0)
+        if vpl < lit.vpls.on_lights:
+            control = lit.vpls.control[vpl]
+    arrives = arriving(scene, control, x.position, x.mesh, x.seen, position)
+    if control >= 0:  # it was weighed with this factor
+        arrives = arrives / emphasis(scene.light_tables[0].controls.rows[control], x.position, position)
+    intensity = wp.vec3(color[0], color[1], color[2])
+    return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
 
 
 @wp.func
@@ -231,8 +241,14 @@ def _gather_in_blocks(
     for lane in range(_LANES):
         passed += sums[lane]
         while drawn < rays and (float(drawn) + u[1]) * share < passed:
-            slot = _LANES * begin + lit.blocks * lane + wp.min(candidate[lane], lit.blocks - 1)
-            out += _shadowed(scene, lit, x, slot, share, max_bounce)
+            k = wp.min(candidate[lane], lit.blocks - 1)
+            slot = _LANES * begin + lit.blocks * lane + k
+            if slot < lit.count:
+                row = _ROWS * (begin + k)
+                p = wp.vec4(
+                    lit.rows[row][lane], lit.rows[row + 1][lane], lit.rows[row + 2][lane], lit.rows[row + 3][lane]
+                )
+                out += _shadowed(scene, lit, x, slot, p, lit.colors[slot], share, max_bounce)
             drawn += 1
     return out
 
@@ -256,7 +272,8 @@ def _gather_one_by_one(
     for slot in range(begin, end):
         running += _weigh_one(scene, lit, x, slot)
         while drawn < rays and (float(drawn) + u[1]) * share < running:
-            out += _shadowed(scene, lit, x, slot, share, max_bounce)
+            position = lit.vpls.position[lit.order[slot]]
+            out += _shadowed(scene, lit, x, slot, position, _color_of(lit, slot), share, max_bounce)
             drawn += 1
     return out
 
@@ -344,6 +361,7 @@ def _pack(first: int, lights: VplSets, surfaces: VplSets) -> None:
             normal = lit.vpls.normal[vpl]
             strength = luminance(lit.vpls.intensity[vpl])
             bound = _bound_of(lit, vpl, normal)
+            lit.colors[slot] = _color_of(lit, slot)
         for k in range(4):
             lit.rows[_ROWS * i + k][lane] = position[k]
             lit.rows[_ROWS * i + 4 + k][lane] = normal[k]
@@ -401,6 +419,7 @@ def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any
         lit.order = order[begin:] if lit.count else order
         blocks = lit.sets * lit.blocks if packed else 0
         lit.rows = launcher.kept(f"gather.{name}.rows", max(_ROWS * blocks, 1), vec16)
+        lit.colors = launcher.kept(f"gather.{name}.colors", max(LANES * blocks, 1), wp.vec4)
         lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
         lit.shapes = launcher.kept(f"gather.{name}.shapes", max(_SHAPE_ROWS * blocks * lit.shaped, 1), vec16)
     if vpls.count:
