@@ -623,14 +623,24 @@ def test_a_mesh_light_is_an_emissive_surface(tmp_path, more, emission, albedo):
     assert scene.lights == () and not scene.meshes[0].double_sided
 
 
-def test_the_camera_sees_the_glow_of_an_independent_material(tmp_path):
-    """MaterialSyncMode = independent: the eye sees the material's emission, the scene is lit by the light's alone."""
-    more = BIND + 'uniform token light:materialSyncMode = "independent"'
-    (material,) = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials
-    assert material.glow == (1.0, 0.5, 0.0) and material.emission == (12.0, 12.0, 12.0)
-    for mode in ("noMaterialResponse", "materialGlowTintsLight"):
-        more = BIND + f'uniform token light:materialSyncMode = "{mode}"'
-        assert load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more)).materials[0].glow is None
+@pytest.mark.parametrize(
+    ("mode", "more", "glow"),
+    [
+        ("independent", "", (1.0, 0.5, 0.0)),
+        ("materialGlowTintsLight", "", (1.0, 0.5, 0.0)),
+        ("materialGlowTintsLight", "float inputs:exposure = -2\n float inputs:intensity = 4", None),
+        ("noMaterialResponse", "", None),
+    ],
+)
+def test_the_camera_sees_the_material_and_not_the_light(tmp_path, mode, more, glow):
+    """The schema: all rays "see the emissive/glow response as dictated by the bound Material", unless it is ignored.
+
+    A light of radiance 1 that a material tints is what the material is.
+    """
+    more += f'\n{BIND}uniform token light:materialSyncMode = "{mode}"'
+    text = MESH_LIGHT.replace("float inputs:intensity = 12", "") if "intensity" in more else MESH_LIGHT
+    (material,) = load(tmp_path, text % ("MeshLightAPI", more)).materials
+    assert material.glow == glow
 
 
 def test_mesh_lights_have_shaping_links_and_shadows(tmp_path):

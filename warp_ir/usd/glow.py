@@ -21,9 +21,10 @@ _BLACK = (0.0, 0.0, 0.0)
 class Lamp:
     """A light whose shape is a gprim, read once, to be put in many places.
 
-    light:materialSyncMode decides what the gprim's materials have to do with it: `materialGlowTintsLight` multiplies
-    the light with the material's own emission (if it has any: else the light emits alone), `independent` shows the
-    camera the material's emission and lights the scene with the light's, `noMaterialResponse` leaves a black emitter.
+    light:materialSyncMode decides what the gprim's materials have to do with it: with `materialGlowTintsLight` and
+    `independent` the camera sees the material's emission while the light lights the scene, with the former multiplied
+    with the material's emission (if it has any: else the light is all there is); `noMaterialResponse` leaves a black
+    emitter.
 
     Args:
         prim: The light: the gprim itself, or a GeometryLight that refers to it.
@@ -99,11 +100,12 @@ class Lamp:
         lit = []
         for material in materials:
             material = replace(material, name=str(self._prim.GetPath()))
+            tinted = self._mode == "materialGlowTintsLight" and max(material.emission) > 0.0
             if self._mode == "noMaterialResponse":
                 material = replace(material, albedo=_BLACK, albedo_texture=None)
-            elif self._mode == "independent":
+            elif self._mode == "independent" or (tinted and (radiance != 1.0).any()):
                 material = replace(material, glow=material.emission, glow_texture=material.emission_texture)
-            if self._mode != "materialGlowTintsLight" or max(material.emission) == 0.0:
+            if not tinted:
                 material = replace(material, emission=(1.0, 1.0, 1.0), emission_texture=None)
             if self._texture is not None and material.emission_texture is None:
                 material = _times(replace(material, emission_texture=self._texture), np.array(material.emission))
