@@ -175,6 +175,47 @@ def test_colour_spaces_are_for_colours(tmp_path):
     assert material.albedo != pytest.approx((0.5, 0.5, 0.0), abs=0.01)
 
 
+SPACED = '{} (prepend apiSchemas = ["ColorSpaceAPI"{}]) {{\n uniform token colorSpace:name = "{}"\n'
+
+
+def spaced(text, name, more="", api="", head='def Material "A"'):
+    """The text with a colour space on its material."""
+    return text.replace(head + " {", SPACED.format(head, api, name) + more)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "counts"),
+    [("exr", "lin_ap1_scene", True), ("exr", "srgb_p3d65_scene", False), ("png", "srgb_p3d65_scene", True),
+     ("png", "lin_ap1_scene", False)],
+)  # fmt: skip
+def test_images_inherit_a_colour_space_that_they_can_have(tmp_path, kind, name, counts):
+    """As on the attribute itself, if both are linear or neither is; else the image is what "auto" makes of it."""
+    linear = kind == "exr"
+    pixels = np.float32([[[0.5, 0.25, 0.125]]]) if linear else np.uint8([[[128, 64, 32]]])
+    write(tmp_path / f"a.{kind}", pixels, oiio.FLOAT if linear else oiio.UINT8)
+    text = textured(file=f"a.{kind}")
+    found = only_material(load(tmp_path, spaced(text, name) + mesh())).albedo_texture.pixels
+    own = text.replace(f"@a.{kind}@", f'@a.{kind}@ (colorSpace = "{name}")') if counts else text
+    expected = only_material(load(tmp_path, own + mesh())).albedo_texture.pixels
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_colour_spaces_that_a_stage_defines(tmp_path):
+    """Primaries of a prim's own, here those of Rec. 2020, by ColorSpaceDefinitionAPI; an unknown one is named."""
+    more = """uniform token colorSpaceDefinition:d:name = "mine"
+        float2 colorSpaceDefinition:d:redChroma = (0.708, 0.292)
+        float2 colorSpaceDefinition:d:greenChroma = (0.170, 0.797)
+        float2 colorSpaceDefinition:d:blueChroma = (0.131, 0.046)
+        float2 colorSpaceDefinition:d:whitePoint = (0.3127, 0.3290)
+"""
+    text = material_text("color3f inputs:diffuseColor = (0.5, 0.4, 0.3)")
+    own = only_material(load(tmp_path, spaced(text, "mine", more, ', "ColorSpaceDefinitionAPI:d"') + mesh()))
+    known = only_material(load(tmp_path, spaced(text, "lin_rec2020_scene") + mesh()))
+    assert own.albedo == pytest.approx(known.albedo, abs=1e-4) and own.albedo[0] > 0.55
+    assert only_material(load(tmp_path, spaced(text, "acescg") + mesh())).albedo[0] > 0.55
+    assert warned(load(tmp_path, spaced(text, "crayon") + mesh()), "/A", "unknown colour space 'crayon'")
+
+
 NORMALMAP = """
     def Shader "N" {
         uniform token info:id = "ND_normalmap_float"

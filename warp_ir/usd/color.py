@@ -75,13 +75,8 @@ def between(source: Gf.ColorSpace | None, target: Gf.ColorSpace | None) -> Float
     return matrix
 
 
-def to_rec709(colors: Floats, name: str) -> Floats:
-    """Colours [..., 3] of a colour space in linear Rec. 709.
-
-    Raises:
-        Unreadable: It is no name of a colour space.
-    """
-    space = color_space(name)
+def to_rec709(colors: Floats, space: Gf.ColorSpace | None) -> Floats:
+    """Colours [..., 3] of a colour space in linear Rec. 709."""
     if space is None:
         return colors
     decode = decoder(space)

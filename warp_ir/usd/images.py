@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdShade
 from warp_ir.mipmap import resized
 from warp_ir.scene import Floats, Texture
 from warp_ir.usd import value
-from warp_ir.usd.color import between, color_space
+from warp_ir.usd.color import between, color_space, decoder
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.signal import Signal, compact
 from warp_ir.usd.texture import MAX_PIXELS, Image, read_texture
@@ -88,7 +88,8 @@ class Images:
         Args:
             attribute: Of an asset.
             time: Of its value.
-            space: Its colour space as a node has it; "auto" if it does not say.
+            space: Its colour space as a node has it; "auto" if it does not say. Then that of a prim above counts, if
+                it is linear as the image is, or as little.
             fallback: Where a tile is missing, rgba.
             channels: Numbers of those that are wanted, of r, g, b and a.
             warn: Says something about the material.
@@ -105,6 +106,10 @@ class Images:
         if "<UDIM>" in asset.path or "<UDIM>" in asset.resolvedPath:
             return self._udim(attribute, time, asset, space, fallback, channels, warn)
         image = self.read(asset, space)
+        inherited = inherited_space(attribute, image) if space == "auto" else ""
+        if inherited:
+            space = inherited
+            image = self.read(asset, space)
         pixels = _converted(_channels(image, channels), space)
         return image, pixels, (asset.resolvedPath or asset.path, space), (1, 1)
 
@@ -159,6 +164,18 @@ def _space(attribute: Usd.Attribute, said: str, warn: Callable[[str], None]) -> 
         warn(f"{attribute.GetName()} has the {trouble}; it is guessed")
         return "auto"
     return found
+
+
+def inherited_space(attribute: Usd.Attribute, image: Image) -> str:
+    """The colour space that a prim gives to an image below it; "" where it gives none that the image can have.
+
+    A linear space says nothing of bytes, nor one for a screen of floats.
+    """
+    try:
+        space = color_space(value.color_space_name(attribute))
+    except Unreadable:  # which the colours of the prim have said
+        return ""
+    return "" if space is None or image.decoded != (decoder(space) is not None) else str(space.GetName())
 
 
 def _channels(image: Image, channels: list[int]) -> Floats:

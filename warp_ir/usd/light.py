@@ -17,6 +17,7 @@ from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd import value
 from warp_ir.usd.color import between, color_space
 from warp_ir.usd.dome import LAYOUTS, to_latlong
+from warp_ir.usd.images import inherited_space
 from warp_ir.usd.inputs import Inputs
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shaping import read_shaping
@@ -186,10 +187,13 @@ def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     layout = inputs.text("texture:format", "automatic") if kind == LightKind.DOME else "latlong"
     if layout not in ("automatic", "latlong", *LAYOUTS):
         inputs.warn(f"texture:format: '{layout}' is no layout; read as latlong")
-    space = str(inputs.attribute("texture:file").GetColorSpace() or "auto")
+    attribute = inputs.attribute("texture:file")
+    space = str(attribute.GetColorSpace() or "auto")
     try:
-        primaries = color_space(space)
         image = read_texture(asset, space, _TEXELS[kind])
+        inherited = inherited_space(attribute, image) if space == "auto" else ""
+        image = read_texture(asset, inherited, _TEXELS[kind]) if inherited else image
+        primaries = color_space(inherited or space)
         pixels = to_latlong(image.rgb, layout) if layout in LAYOUTS else image.rgb
     except Unreadable as trouble:
         inputs.warn(f"texture:file: {trouble}; it emits its constant colour")

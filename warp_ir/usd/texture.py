@@ -43,6 +43,8 @@ class Image:
     width: int
     """In the file: `pixels` may be fewer."""
     height: int
+    decoded: bool = False
+    """Whether colour was not linear in the file."""
     wrap: tuple[str, str] = ("", "")
     """Wrap modes in s and t that the file asks for: "black", "clamp", "repeat", "mirror", or "" if it does not."""
 
@@ -156,7 +158,7 @@ def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
         small[top // factor : -(-bottom // factor)] = _averaged(values, factor)
     if not np.isfinite(small).all():
         small = np.nan_to_num(small, nan=0.0, posinf=65504.0, neginf=0.0)
-    return Image(small, width, height, _wrap_modes(spec))
+    return Image(small, width, height, decode is not None, _wrap_modes(spec))
 
 
 def _averaged(values: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:

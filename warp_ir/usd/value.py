@@ -6,7 +6,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Ints
-from warp_ir.usd.color import to_rec709
+from warp_ir.usd.color import color_space, to_rec709
 from warp_ir.usd.report import Unreadable
 
 
@@ -121,9 +121,22 @@ def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color
 def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
     """Colours [n, 3] of an attribute, taken from its colour space (its own, its prim's or an ancestor's)."""
     try:
-        return to_rec709(colors, str(Usd.ColorSpaceAPI.ComputeColorSpaceName(attribute, None) or ""))
+        return to_rec709(colors, color_space(color_space_name(attribute)))
     except Unreadable as trouble:
-        raise Unreadable(f"{attribute.GetName()} has the {trouble}") from None
+        defined = Usd.ColorSpaceAPI.ComputeColorSpace(attribute, None)  # by a prim above
+        if not defined.GetName():
+            raise Unreadable(f"{attribute.GetName()} has the {trouble}") from None
+        return to_rec709(colors, defined)
+
+
+def color_space_name(attribute: Usd.Attribute) -> str:
+    """The colour space of an attribute, else of its prim or the nearest above that has one, known or not; else ""."""
+    name, prim = str(attribute.GetColorSpace() or ""), attribute.GetPrim()
+    while not name and not prim.IsPseudoRoot():
+        if prim.HasAPI(Usd.ColorSpaceAPI):
+            name = text(Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr(), Usd.TimeCode.Default())
+        prim = prim.GetParent()
+    return name
 
 
 def is_color(attribute: Usd.Attribute) -> bool:
