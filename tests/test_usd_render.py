@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Tf, UsdGeom
 
-from tests.test_usd_material import QUADS, diffuse, load, only_material
+from tests.test_usd_look import mesh, textured
+from tests.test_usd_material import QUADS, diffuse, load, material_text, only_material
+from tests.test_usd_texture import write
 from warp_ir import InputError, RenderSettings, load_usd
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse
@@ -224,6 +227,27 @@ def test_info_lists(tmp_path, capsys):
     assert facts["cost"]["load_seconds"] > 0.0 and facts["moving_meshes"] == 0
     assert main(["info", file]) == 0
     assert "costs" in capsys.readouterr().out
+
+
+def test_info_tells_what_materials_are(tmp_path, capsys, monkeypatch):
+    """Opacity, cut-outs and textures stand beside the colours, and of what there is nothing of no count is shown."""
+    image = np.zeros((1, 1, 4), np.uint8)
+    write(tmp_path / "a.png", image)
+    half = material_text("float inputs:opacity = 0.5", "B") + mesh(name="N").replace("</A>", "</B>")
+    file = stage(
+        tmp_path, textured("float inputs:opacityThreshold = 0.25") + mesh() + half, "startTimeCode = 3\nendTimeCode = 4"
+    )
+    monkeypatch.setattr(UsdGeom, "GetStageMetersPerUnit", refuse)  # as for a value of another type
+    assert main(["info", str(file), "-q"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        ", a.png  /A" in out and ", opacity 0.5  /B" in out and "3 to 4; this is 3" in out and "0.01 m per unit" in out
+    )
+    assert "2 meshes" in out and "prims outside pass" not in out
+
+
+def refuse(_: object) -> float:
+    raise Tf.ErrorException("expected double, got float")
 
 
 # ---- masks, variants, session layers, default time -------------------------------------------------------

@@ -74,6 +74,10 @@ def test_composition_errors_are_listed_once_and_not_spilled(tmp_path, capfd):
     assert sum("gone.usda" in line for line in scene.warnings) == 1
     assert len(scene.meshes) == 1 and scene.stats["composition_errors"] == 1
     assert capfd.readouterr() == ("", "")
+    many = [f'def "A{k}" (references = @gone.usda@) {{\n}}' for k in range(9)]
+    scene = load(tmp_path, "\n".join([*many, 'def "B" (references = @lost.usda@) {\n}']))
+    assert warned(scene, "gone.usda", "8 times more") and warned(scene, "lost.usda")
+    assert sum("composition" in line for line in scene.warnings) == 2 and scene.stats["composition_errors"] == 10
 
 
 def test_metadata_of_the_wrong_kind_do_not_stop_the_load(tmp_path):

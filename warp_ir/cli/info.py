@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     reader = open_reader(args)
     scene = reader.read(moment_of(args))
-    facts = describe(scene, reader, time.perf_counter() - begin)
+    facts = describe(scene, reader, time.perf_counter() - begin, moment_of(args))
     if args.list:
         _print_list(facts, args.list)
         return 0
@@ -47,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def describe(scene: Scene, reader: Any, seconds: float) -> dict[str, Any]:
+def describe(scene: Scene, reader: Any, seconds: float, moment: float | str | None) -> dict[str, Any]:
     """The scene in plain values, with what only the stage itself knows, and the seconds it took to load."""
     lower, upper = scene.bounds()
-    camera, cost, known = scene.camera, scene_bytes(scene), stage_facts(reader)
+    camera, cost, known = scene.camera, scene_bytes(scene), stage_facts(reader, moment)
     return {
         "stage": str(reader.source),
         **known,
@@ -149,6 +149,8 @@ def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
         found["camera"] = "one that frames the scene from outside, for there is none"
     elif any("rendered because it is the first" in line for line in scene.warnings):
         found["camera"] = f"the first of {len(cameras)}"
+    if any("used because they are the first of" in line for line in scene.warnings):
+        found["settings"] = "the first there are"
     if any(light.name == "default dome" for light in scene.lights):
         found["light"] = "a white dome of radiance 1, for nothing emits"
     return found
@@ -170,7 +172,8 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     _row("stage", facts["stage"])
     _row("up axis", f"{facts['up_axis']}, {facts['meters_per_unit']:g} m per unit")
     if facts["frames"]:
-        _row("frames", "{:g} to {:g}".format(*facts["frames"]))
+        (first, last), at = facts["frames"], facts["time"]
+        _row("frames", f"{first:g} to {last:g}; this is {'the default time' if at is None else f'{at:g}'}")
     _row(
         "camera",
         f"{camera['name'] or '(around it all)'}, {camera['projection']}, aspect {camera['aspect']:.4g}",
@@ -202,7 +205,8 @@ def _print_table(facts: dict[str, Any], most: float) -> None:
     )
     _list("skipped", [f"{value} {key.replace('_', ' ')}" for key, value in facts["skipped"].items()], most)
     _list("guessed", [f"{key}: {value}" for key, value in facts["guessed"].items()], most)
-    _list("counts", [f"{value:9} {key.replace('_', ' ')}" for key, value in facts["counts"].items()], math.inf)
+    counts = {key.replace("_", " "): value for key, value in facts["counts"].items() if value}
+    _list("counts", [f"{value:9} {key}" for key, value in counts.items()], math.inf)
 
 
 def _print_list(facts: dict[str, Any], what: str) -> None:
@@ -245,9 +249,20 @@ def _parts(cost: dict[str, Any]) -> str:
 
 def _material_lines(facts: dict[str, Any]) -> list[str]:
     return [
-        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}  {m['name'] or '(default)'}"
+        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}{_beyond(m)}  {m['name'] or '(default)'}"
         for m in facts["materials"]
     ]
+
+
+def _beyond(material: dict[str, Any]) -> str:
+    """What there is to a material beyond its colours, in a few words."""
+    words = []
+    if material["cutoff"] > 0.0:
+        words.append(f"cut out below opacity {material['cutoff']:.4g}")
+    elif material["opacity"] < 1.0:
+        words.append(f"opacity {material['opacity']:.4g}")
+    words += dict.fromkeys(name.rsplit("/", 1)[-1] or "a texture" for name in material["textures"])
+    return "".join(f", {word}" for word in words)
 
 
 def _settings_lines(facts: dict[str, Any]) -> list[str]:

@@ -38,23 +38,30 @@ def moment_of(args: argparse.Namespace) -> float | str | None:
     return "default" if args.default_time else args.time
 
 
-def stage_facts(reader: Any) -> dict[str, Any]:
-    """Axis, unit, frames, cameras and settings: what a renderer does not need to know, and a user might."""
-    from pxr import UsdGeom, UsdRender
+def stage_facts(reader: Any, moment: float | str | None = None) -> dict[str, Any]:
+    """Axis, unit, frames, cameras and settings: what a renderer does not need to know, and a user might.
+
+    Args:
+        reader: A `StageReader`.
+        moment: What is shown, as for its `read`.
+    """
+    from pxr import UsdRender
 
     from warp_ir.usd.camera import all_cameras
     from warp_ir.usd.render_spec import render_settings_prims
     from warp_ir.usd.report import Report
-    from warp_ir.usd.stage import quiet, up_axis
+    from warp_ir.usd.stage import quiet, time_code, up_axis
 
     stage = reader.stage
     with quiet():
-        spec = reader.spec()
+        spec = reader.spec(moment)
+        code = time_code(stage, moment)
         frames = [stage.GetStartTimeCode(), stage.GetEndTimeCode()] if stage.HasAuthoredTimeCodeRange() else None
         return {
             "up_axis": up_axis(stage, Report(reader.source)),  # what it says, the reader has said
-            "meters_per_unit": float(UsdGeom.GetStageMetersPerUnit(stage)),
+            "meters_per_unit": _meters_per_unit(stage),
             "frames": frames,
+            "time": None if code.IsDefault() else code.GetValue(),
             "cameras": [str(prim.GetPath()) for prim in all_cameras(stage)],
             "render_passes": [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Pass)],
             "render_settings": {
@@ -75,3 +82,14 @@ def stage_facts(reader: Any) -> dict[str, Any]:
                 ],
             },
         }
+
+
+def _meters_per_unit(stage: Any) -> float:
+    """Of the stage's metadata, which files also hold as another type: USD refuses those."""
+    from pxr import Tf, UsdGeom
+
+    try:
+        return float(UsdGeom.GetStageMetersPerUnit(stage))
+    except Tf.ErrorException:
+        stored = stage.GetMetadata("metersPerUnit")
+        return float(stored) if isinstance(stored, int | float) else 0.01

@@ -75,10 +75,14 @@ def open_stage(
     except (Tf.ErrorException, RuntimeError) as error:
         raise _unopened(path, error) from None
     errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
-    for text in list(errors)[:_SHOWN]:
-        report.warn("/", f"composition: {text}")
-    if len(errors) > _SHOWN:
-        report.warn("/", f"composition: {len(errors) - _SHOWN} more errors")
+    causes: dict[str, list[str]] = {}
+    for text in errors:  # one file that is missing may be sought from many places
+        causes.setdefault(text.partition(" introduced by ")[0], []).append(text)
+    for texts in list(causes.values())[:_SHOWN]:
+        more = f" and {len(texts) - 1} times more" if len(texts) > 1 else ""
+        report.warn("/", f"composition: {texts[0].removesuffix('.')}{more}")
+    if len(causes) > _SHOWN:
+        report.warn("/", f"composition: {len(causes) - _SHOWN} more errors")
     report.stats["composition_errors"] = len(errors)
     return stage
 

@@ -71,9 +71,8 @@ def read_material(
         approximate = reader_of(shader)
         terms = None if approximate is None else approximate(found)
         if terms is not None:
-            found.warn(
-                f"of its shader {shader_name(shader)} base colour, emission and opacity are read ({{n}} materials)"
-            )
+            what = "is rendered by base colour, emission and opacity alone ({n} materials)"
+            found.warn(f"its shader {shader_name(shader)} {what}")
             albedo = _metal(found, terms.metallic, terms.albedo)
             normal = None if terms.normal is None else found.tangent_normal("normal", terms.normal)
             return _surface(found, albedo, terms.emission, terms.opacity, terms.threshold, normal)
