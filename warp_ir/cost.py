@@ -10,7 +10,7 @@ from warp_ir.settings import RenderSettings
 
 # Bytes on the device, measured on the CPU; a GPU takes about as many.
 _BASE = 7500  # sequences, and a row of each table that is empty
-_TRIANGLE = 24  # its material, mesh, sides, and where its normals, colours and uvs are
+_TRIANGLE = 28  # its material, mesh, sides, and where its normals, colours, uvs and tangents are
 _TREE = 67  # of its share of the hierarchy
 _POINT = _INDICES = 12
 _CORNER = 12  # of a normal or a colour
@@ -73,7 +73,7 @@ def _add_surfaces(scene: Scene, out: dict[str, float], seen: set[object]) -> int
             continue
         count = len(mesh.triangles) * copies
         triangles += count
-        corners = _CORNER * 3 * ((mesh.normals is not None) + (mesh.colors is not None))
+        corners = _CORNER * 3 * sum(x is not None for x in (mesh.normals, mesh.colors, mesh.tangents))
         corners += _UV * 3 * len(uv_sets) * any(name in mesh.uvs for name in uv_sets)
         out["geometry"] += count * (_TRIANGLE + _INDICES + corners)
         geometry = id(mesh.points), id(mesh.triangles)

@@ -201,6 +201,8 @@ class Mesh:
     """Texture coordinates of the triangles' corners by name, float32 [m, 3, 2]."""
     bare: npt.NDArray[np.bool_] | None = None
     """bool [m], triangles that take the colour of their instance where `Instances.colors` has one; None: none do."""
+    tangents: Floats | None = None
+    """float32 [m, 3, 3], directions in which u grows at the corners, for normal maps; None: each triangle's own."""
     light: MeshLight | None = None
     """Shaping, links and shadows of what its materials emit; None: it emits all around, lights everything, and
     everything shadows it."""
@@ -512,6 +514,9 @@ def _written_out(mesh: Mesh, group: Instances, materials: Sequence[Material]) ->
         for f in fields(mesh)
         if f.name not in ("points", "triangles", "normals", "bare")
     }
+    if mesh.tangents is not None:
+        linear = np.repeat(group.matrices[:, :3, :3], 3 * len(mesh.triangles), axis=0)
+        tables["tangents"] = np.einsum("nij,nj->ni", linear, tables["tangents"].reshape(-1, 3)).reshape(-1, 3, 3)
     if group.colors is not None and mesh.bare is not None:
         own = mesh.colors
         if own is None:

@@ -282,6 +282,16 @@ def _mapped(address: wp.uint64, hit: Hit, normal: wp.vec3, footprint: float) -> 
     turn = wp.sign(ab_uv[0] * ac_uv[1] - ab_uv[1] * ac_uv[0])
     along_u = turn * (ab * ac_uv[1] - ac * ab_uv[1])
     along_v = turn * (ac * ab_uv[0] - ab * ac_uv[0])
+    smooth = p.triangle_tangents[hit.triangle]
+    if smooth >= 0:
+        a = p.corner_tangents[smooth]
+        b = p.corner_tangents[smooth + 1]
+        c = p.corner_tangents[smooth + 2]
+        mean = hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c
+        if hit.instance >= 0:
+            mean = scene.instance_axes[hit.instance] * mean
+        if wp.length_sq(mean) > 0.0:
+            along_u = mean
     out = wp.where(hit.front == 1, normal, -normal)
     x = wp.normalize(along_u - out * wp.dot(out, along_u))
     y = wp.cross(out, x)

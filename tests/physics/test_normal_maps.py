@@ -82,6 +82,24 @@ def test_instances(linear, device):
     assert film.radiance() == pytest.approx(ALBEDO * (normal @ SUN), abs=1e-5)
 
 
+@pytest.mark.parametrize("linear", [None, np.diag([3.0, 1.0, 0.5]), np.diag([-1.0, 1.0, 1.0])])
+def test_given_tangents_count(linear, device):
+    """Tangents that a mesh brings are where u grows, projected onto the surface; v keeps its side."""
+    mesh, camera = floor(LAYOUTS["upright"][0])
+    tangents = np.broadcast_to(np.float32([1.0, 0.7, -1.0]), (len(mesh.triangles), 3, 3)).copy()
+    mesh = dataclasses.replace(mesh, tangents=tangents)
+    instances = () if linear is None else (Instances("i", (0,), placed(linear, (0, 0, 0))[None]),)
+    turned = np.array([1.0, 0.7, -1.0]) if linear is None else linear @ (1.0, 0.7, -1.0)
+    along = np.array([turned[0], 0.0, turned[2]]) / np.hypot(turned[0], turned[2])
+    across = np.cross([0.0, 1.0, 0.0], along)
+    across *= np.sign(across @ (0.0, 0.0, -1.0))
+    normal = TILT @ np.array([along, across, [0, 1, 0]])
+    scene = lit(mesh, camera, one_texel(TEXEL), sun(), instances=instances)
+    for written in (False, True):
+        film = render(scene.flat() if written else scene, "path", device, iterations=1, max_bounces=0)
+        assert film.radiance() == pytest.approx(ALBEDO * (normal @ SUN), abs=1e-5)
+
+
 @pytest.mark.parametrize("texture", [one_texel((0, 0, 3.0)), one_texel((0, 0, 0.0)), one_texel((1e-9, 0, 0))])
 def test_flat_and_empty_maps_change_nothing(texture, device):
     """A normal straight up, of any length, and one without a direction, leave the smooth one."""

@@ -129,7 +129,7 @@ def _check_mesh(mesh: Mesh) -> None:
             f"triangles refer to points outside 0..{len(mesh.points) - 1}",
         )
         demand(np.isfinite(mesh.points[mesh.triangles]).all(), "points must be finite")
-    for name, corners in (("normals", mesh.normals), ("colors", mesh.colors)):
+    for name, corners in (("normals", mesh.normals), ("colors", mesh.colors), ("tangents", mesh.tangents)):
         if corners is not None:
             demand(corners.shape == (count, 3, 3), f"{name} must have shape [m, 3, 3]")
             demand(np.isfinite(corners).all(), f"{name} must be finite")

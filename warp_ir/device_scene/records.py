@@ -23,6 +23,8 @@ class Patterns:
     textures: TextureTable
     triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
     corner_uvs: wp.array[wp.vec2]
+    triangle_tangents: wp.array[wp.int32]  # [m], first of its three rows in corner_tangents; -1: its own
+    corner_tangents: wp.array[wp.vec3]  # directions in which u grows
     glow: wp.array[wp.vec3]  # [materials], what the camera sees in place of the emission; negative: nothing else
     glow_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
     normal_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none

@@ -31,8 +31,12 @@ _TYPES = {
     "corner_colors": wp.vec3,
     "triangle_uvs": wp.int32,
     "corner_uvs": wp.vec2,
+    "triangle_tangents": wp.int32,
+    "corner_tangents": wp.vec3,
 }
-_CORNERS = ("corner_normals", "corner_colors", "corner_uvs")
+_CORNERS = ("corner_normals", "corner_colors", "corner_uvs", "corner_tangents")
+_PATTERNS = ("triangle_uvs", "corner_uvs", "triangle_tangents", "corner_tangents")
+"""Those that are for textures."""
 
 
 class Surfaces:
@@ -84,13 +88,11 @@ class Surfaces:
         launcher, here = self._launcher, self._layout.moments[moment]
         data.triangle_count = self._layout.triangle_count
         for name in _TYPES:
-            if name not in ("triangle_uvs", "corner_uvs"):
+            if name not in _PATTERNS:
                 setattr(data, name, self._tables[name].array)
         patterns = upload_materials(here.scene.materials, self._texture_table, data, launcher)
-        patterns.triangle_uvs, patterns.corner_uvs = (
-            self._tables["triangle_uvs"].array,
-            self._tables["corner_uvs"].array,
-        )
+        for name in _PATTERNS:
+            setattr(patterns, name, self._tables[name].array)
         data.patterns = launcher.array([patterns], Patterns)
         data.bvh = self._bvhs[moment]
         roots = [self._trees.root(part.tree) for part in here.prototypes]
@@ -198,7 +200,7 @@ class Surfaces:
         out["triangle_material"] = _per_triangle([mesh.material for mesh in meshes])
         out["triangle_mesh"] = _numbered(parts)
         out["emits_back"] = np.repeat(np.array([mesh.double_sided for mesh in meshes], np.int32), counts)
-        for name in ("normals", "colors"):
+        for name in ("normals", "colors", "tangents"):
             values = [getattr(mesh, name) for mesh in meshes]
             rows, table = corner_tables(values, counts, first[f"corner_{name}"])
             out[f"triangle_{name}"], out[f"corner_{name}"] = rows, table

@@ -1,6 +1,6 @@
 """Gprims to meshes: each shape read once, given its look, and placed wherever it is drawn, or kept as a prototype."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
 from warp_ir.usd.sharing import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share
 from warp_ir.usd.skel import Skinning, sharing_key
+from warp_ir.usd.tangents import smooth_tangents
 from warp_ir.usd.walk import LIGHT_COPIES, Site
 
 _Shapes = dict[tuple[Sdf.Path, ...], Shape | None]
@@ -288,7 +289,27 @@ class _Builder:
                 colors = None  # a light that answers with no material reflects no colour either
         # Of the implicit shapes only the plane is double-sided unless it says otherwise; its schema knows.
         double_sided = value.flag(prim.GetAttribute("doubleSided"), self._time)
-        return Mesh(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare, light)
+        tangents = self._tangents(points, triangles, normals, uvs, material)
+        return Mesh(
+            *(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare),
+            tangents=tangents,
+            light=light,
+        )
+
+    def _tangents(
+        self, points: Floats, triangles: Ints, normals: Floats | None, uvs: Mapping[str, Floats], material: Ints
+    ) -> Floats | None:
+        """Those of smooth surfaces with normal maps, float32 [m, 3, 3]; None where triangles' own will do."""
+        maps = {int(k): self._table.materials[k].normal_texture for k in np.unique(material)}
+        names = {k: texture.uv for k, texture in maps.items() if texture is not None and texture.uv in uvs}
+        if normals is None or not names:
+            return None
+        tangents = np.zeros((len(triangles), 3, 3), np.float32)
+        for name in dict.fromkeys(names.values()):
+            chosen = np.isin(material, [k for k, uv in names.items() if uv == name])
+            of_these = triangles[chosen], normals[chosen], uvs[name][chosen]
+            tangents[chosen] = smooth_tangents(points, *of_these)
+        return tangents
 
     def _placed(self, shape: Shape, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
         """Copies of a shape; the same arrays for prototypes of the same geometry, which then share their tree."""
