@@ -300,10 +300,18 @@ def test_mirrored_instances_keep_their_texture(tmp_path, image):
     np.testing.assert_array_equal(scene.meshes[0].uvs["st"], np.abs(points[..., :2]))
 
 
+def test_coordinates_of_another_name(tmp_path, image):
+    """A mesh that lacks the set that a material asks for, and has another, is textured by it: named."""
+    scene = load(tmp_path, textured() + mesh(ST.replace("primvars:st", "primvars:UVMap")))
+    np.testing.assert_array_equal(scene.meshes[0].uvs["st"], load(tmp_path, textured() + mesh()).meshes[0].uvs["st"])
+    assert warned(scene, "/M", "no primvar 'st'", "'UVMap' does")
+
+
 @pytest.mark.parametrize(
     "more, word",
     [
         ("", "no primvar 'st'"),
+        ("float2[] primvars:uv = [(0, 0)]", "no primvar 'st'"),
         ("texCoord2f[] primvars:st = [(0, 0)] (interpolation = 'vertex')", "are needed"),
         ("int primvars:st = 3", "not an array"),
         ("texCoord2f[] primvars:st = [(0, 0), (1, 0), (nan, 1), (0, 1), (inf, 0), (2, 1)] (interpolation = 'vertex')",

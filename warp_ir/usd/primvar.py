@@ -1,12 +1,14 @@
 """Primvars: from values per prim, face, point or face-vertex to one value per corner of each triangle."""
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd import value
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Shape
+
+_COORDINATES = Sdf.ValueRoleNames.TextureCoordinate
 
 
 def expand(shape: Shape, values: Floats, interpolation: str, indices: Ints | None = None) -> Floats:
@@ -122,8 +124,12 @@ def texture_coordinates(prim: Usd.Prim, shape: Shape, name: str, time: Usd.TimeC
     """The prim's own or inherited uv set, float32 [m, 3, 2]; None, and named, where there is none that can be used."""
     found = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
     if not found or not found.HasValue():
-        report.warn(prim.GetPath(), f"no primvar '{name}' to place textures by: one point of them is shown")
-        return None
+        others = UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance()
+        found = next((other for other in others if other.GetTypeName().role == _COORDINATES and other.HasValue()), None)
+        if found is None:
+            report.warn(prim.GetPath(), f"no primvar '{name}' to place textures by: one point of them is shown")
+            return None
+        report.warn(prim.GetPath(), f"no primvar '{name}' to place textures by: '{found.GetPrimvarName()}' does")
     try:
         size = np.shape(value.raw(found.GetAttr(), time))[-1:]
         values = value.floats(found.GetAttr(), time, 3 if size == (3,) else 2)
