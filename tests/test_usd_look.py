@@ -678,6 +678,28 @@ def test_what_is_read_in_vain_is_named(tmp_path, image):
 
 
 @pytest.mark.parametrize(
+    ("inputs", "terminal", "named"),
+    [
+        ("", "S.outputs:displacement", False),  # which exporters always connect
+        ("float inputs:displacement = 0", "S.outputs:displacement", False),
+        ("float inputs:displacement = 0.1", "S.outputs:displacement", True),
+        ("", "D.outputs:out", True),
+    ],
+)
+def test_displacement_is_named(tmp_path, inputs, terminal, named):
+    """Where there is some: an amount, or a shader of its own; once, with the number of materials."""
+    node = 'def Shader "D" {\n uniform token info:id = "ND_displacement_float"\n token outputs:out\n}\n'
+    text = f"token outputs:displacement.connect = </A/{terminal}>\n {node}\n token outputs:surface.connect"
+    text = material_text(inputs).replace("token outputs:surface.connect", text, 1)
+    text = text.replace("token outputs:surface\n", "token outputs:surface\n token outputs:displacement\n")
+    scene = load(
+        tmp_path,
+        text + text.replace('"A"', '"B"').replace("</A", "</B") + mesh() + mesh(name="N").replace("</A>", "</B>"),
+    )
+    assert warned(scene, "/A, /B", "displacement is not rendered (2 materials)") == named
+
+
+@pytest.mark.parametrize(
     "inputs",
     [
         "float4 inputs:scale = (1e38, 1e38, 1e38, 1)",

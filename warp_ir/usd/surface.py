@@ -62,6 +62,10 @@ def read_material(
     contexts = dict.fromkeys(["", "mtlx", *(name.removeprefix("outputs:").rpartition(":")[0] for name in outputs)])
     sources = [source for context in contexts if (source := material.ComputeSurfaceSource(context)[0])]
     shaders = list({source.GetPath(): UsdShade.Shader(source) for source in sources}.values())
+    there = {shader.GetPath() for shader in shaders}
+    displaced = [material.ComputeDisplacementSource(context)[0] for context in contexts]
+    if any(source and source.GetPath() not in there for source in displaced):
+        images.report.warn(path, "displacement is not rendered ({n} materials)")
     inputs = [_Inputs(s.ConnectableAPI(), Network(images, path, time), black_metals) for s in shaders]
     for shader, found in zip(shaders, inputs, strict=True):
         read = _READERS.get(shader.GetShaderId())
@@ -162,12 +166,11 @@ class _Inputs:
         for primvar in signal.primvars:
             self.warn(f"{what} reads the primvar '{primvar.name}': it takes the reader's fallback")
 
-    def unread(self, *names: str) -> None:
-        """Name the inputs that are authored in vain."""
-        for name in names:
-            given = value.producer(self._shader.GetInput(name))
-            if given is not None and UsdShade.Output.IsOutput(given):
-                self.warn(f"{name} is not rendered ({{n}} materials)")
+    def unread(self, name: str) -> None:
+        """Name an input that is fed by a node, or is not 0, in vain."""
+        given = value.producer(self._shader.GetInput(name))
+        if given is not None and (UsdShade.Output.IsOutput(given) or self.number(name, 0.0) != 0.0):
+            self.warn(f"{name} is not rendered ({{n}} materials)")
 
     def unrendered(self, name: str, what: str) -> None:
         """Say that something is not rendered, if its weight is not 0."""
