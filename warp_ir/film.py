@@ -234,7 +234,8 @@ class Film:
                 else:
                     albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._sum(*_RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
-                picture = denoise(noisy, albedo, normal, clean)
+                limit = None if self.settings is None else self.settings.time_limit
+                picture = denoise(noisy, albedo, normal, clean, limit)
             self._denoised = (self.iterations, picture)
         return np.asarray(self._denoised[1])
 

@@ -35,7 +35,7 @@ import warp_ir.reconstruction.filter
 import warp_ir.reconstruction.observations
 import warp_ir.vpl
 from warp_ir.cost import pixel_bytes
-from warp_ir.denoise import require_denoiser
+from warp_ir.denoise import denoise_seconds
 from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
@@ -83,7 +83,7 @@ class Renderer:
         """The settings as given; in `settings` the height is definite."""
         self.settings = _with_height(settings, scene)
         if settings.denoise:
-            require_denoiser()  # before the work, not after it
+            denoise_seconds(1)  # before the work, not after it: it may be missing, and takes its time to start
         self.launcher = Launcher(device, threads)
         self._check_memory(scene)
         self.launcher.load(_modules(settings.estimator, self.launcher))
@@ -187,8 +187,7 @@ class Renderer:
                 except Cancelled:
                     break
                 looking = (self._primary_seconds() - looked) / (film.iterations - done)
-                reserve = 0.0 if film.reconstruction is None else looking * film.reconstruction.passes(film.iterations)
-                report = _progress(film, self.settings, error, reserve)
+                report = _progress(film, self.settings, error, self._finishing_seconds(film, looking))
                 if progress is not None:
                     progress(report)
                 if report.fraction >= 1.0:
@@ -198,6 +197,15 @@ class Renderer:
         film.timings = self.launcher.profile.seconds()
         film.counts = {"iterations": film.iterations, **self.launcher.profile.counts}
         return film
+
+    def _finishing_seconds(self, film: Film, looking: float) -> float:
+        """What making the picture will take [s], if camera rays through all pixels take `looking`."""
+        seconds = 0.0
+        if film.reconstruction is not None:
+            seconds += looking * film.reconstruction.passes(film.iterations)
+        if self.settings.denoise:
+            seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
+        return seconds
 
     def _primary_seconds(self) -> float:
         """What camera rays have taken so far [s]; it tells what filtering will take."""

@@ -105,6 +105,24 @@ def test_denoise_needs_its_extra(monkeypatch):
         ir.render(cornell_box(), ir.RenderSettings(width=8, height=8, iterations=2, denoise=True))
 
 
+def test_time_for_the_denoiser_is_kept(monkeypatch):
+    """Of a time limit the rays get what the denoiser will not need: a slow one leaves them little."""
+    pytest.importorskip("pyoidn")
+    monkeypatch.setattr("warp_ir.renderer.denoise_seconds", lambda pixels, time_limit=None: 9.5)
+    film = ir.render(cornell_box(), ir.RenderSettings(width=16, height=16, time_limit=10.0, denoise=True))
+    assert 1 <= film.iterations and film.seconds < 5.0
+
+
+def test_the_denoiser_hurries_where_time_is_short():
+    """The smaller network is for pictures whose time the larger one would use up."""
+    pytest.importorskip("pyoidn")
+    from warp_ir.denoise import denoise_seconds
+
+    full = denoise_seconds(10**5)
+    assert denoise_seconds(10**5, 100.0 * full) == full
+    assert 0.0 < denoise_seconds(10**5, full) < 0.5 * full
+
+
 def test_denoised_and_filtered(truth):
     """The errors of two unlike filters are hardly related: their mean has less than either."""
     pytest.importorskip("pyoidn")
