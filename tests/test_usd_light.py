@@ -234,6 +234,20 @@ def test_portals_cost_no_word(tmp_path):
     assert len(scene.lights) == 1 and not warned(scene, "/L")
 
 
+@pytest.mark.parametrize("prefix", ["inputs:", ""])
+def test_shaping_counts_where_the_schema_is_not_applied(tmp_path, prefix):
+    """Authored inputs of ShapingAPI shape the light without it, in old style too; what is not authored is no limit."""
+    more = f"float {prefix}shaping:cone:angle = 30\nfloat {prefix}shaping:cone:softness = 0.5"
+    scene = load(tmp_path, light_text("SphereLight", more))
+    shape = scene.lights[0].shaping
+    assert (shape.cone_angle, shape.cone_softness, shape.focus) == (30.0, 0.5, 0.0)
+    assert warned(scene, "/L", "ShapingAPI is not applied")
+    focused = load(tmp_path, light_text("SphereLight", f"float {prefix}shaping:focus = 2"))
+    assert focused.lights[0].shaping.cone_angle == 180.0 and focused.lights[0].shaping.focus == 2.0
+    idle = load(tmp_path, light_text("DiskLight", f"float {prefix}shaping:cone:angle = 180"))
+    assert idle.lights[0].shaping is None and not warned(idle, "ShapingAPI")
+
+
 def shaping(folder, kind, more):
     return load(folder, light_text(kind, more, SHAPED)).lights[0].shaping
 
@@ -247,7 +261,6 @@ def test_shaping_is_read(tmp_path):
     color3f inputs:shaping:focusTint = (0.5, 0, -1)"""
     read = shaping(tmp_path, "RectLight", text)
     assert (read.cone_angle, read.cone_softness, read.focus, read.focus_tint) == (30.0, 1.0, 4.0, (0.5, 0.0, 0.0))
-    assert load(tmp_path, light_text("SphereLight", text)).lights[0].shaping is None  # not applied
 
 
 @pytest.mark.parametrize(
@@ -483,11 +496,14 @@ def test_a_cross_of_another_shape_is_named(tmp_path):
 
 
 def test_shadows_can_be_switched_off(tmp_path):
-    """ShadowAPI's enable, where the schema is applied."""
+    """ShadowAPI's enable, also where it is authored without the schema, which is named."""
     off = "bool inputs:shadow:enable = 0"
     scene = load(tmp_path, light_text("RectLight", off, SHADOWS))
     assert not scene.lights[0].shadows and not warned(scene, "/L")
-    assert load(tmp_path, light_text("RectLight", off)).lights[0].shadows
+    scene = load(tmp_path, light_text("RectLight", off))
+    assert not scene.lights[0].shadows and warned(scene, "/L", "ShadowAPI is not applied")
+    scene = load(tmp_path, light_text("RectLight", "bool inputs:shadow:enable = 1"))
+    assert scene.lights[0].shadows and not warned(scene, "/L")
 
 
 LINKED = """

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdLux
+from pxr import Tf, Usd, UsdGeom
 
 from warp_ir.scene import Floats, LightKind, Material, MeshLight, Shaping, Texture
 from warp_ir.usd import value
 from warp_ir.usd.inputs import Inputs
-from warp_ir.usd.light import as_color, emission, light_texture, warn_of_unread
+from warp_ir.usd.light import as_color, casts_shadows, emission, light_texture, warn_of_unread
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shaping import read_shaping
 
@@ -45,7 +45,7 @@ class Lamp:
         try:
             self._normalize = inputs.flag("normalize")
             self._shaping = read_shaping(inputs, LightKind.SPHERE)
-            self._shadows = not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True)
+            self._shadows = casts_shadows(inputs)
             warn_of_unread(inputs)
             self._radiance = emission(inputs)
         except Unreadable as trouble:

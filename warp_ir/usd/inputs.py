@@ -29,6 +29,11 @@ class Inputs:
             return old
         return current
 
+    def authored(self, *names: str) -> bool:
+        """Whether a file gives a value to any of these inputs."""
+        attributes = (self.attribute(name) for name in names)
+        return any(attribute and attribute.HasAuthoredValue() for attribute in attributes)
+
     def number(self, name: str, default: float) -> float:
         """A number input."""
         return value.number(self.attribute(name), self.time, default)

@@ -91,7 +91,7 @@ def read_light(
         as_color(radiance),
         texture=light_texture(inputs, kind),
         shaping=read_shaping(inputs, kind),
-        shadows=not prim.HasAPI(UsdLux.ShadowAPI) or inputs.flag("shadow:enable", True),
+        shadows=casts_shadows(inputs),
     )
     place = _Placing(inputs, first, radiance)
     found = (place(matrix) for matrix in matrices)
@@ -222,6 +222,18 @@ def projected_solid_angle(angle: float) -> float:
     return math.pi * (sine2 if theta <= 0.5 * math.pi else 2.0 - sine2)
 
 
+def casts_shadows(inputs: Inputs) -> bool:
+    """What shadow:enable says, whether or not ShadowAPI is applied, as for shaping.
+
+    Raises:
+        Unreadable: It has the wrong type.
+    """
+    casts = inputs.flag("shadow:enable", True)
+    if not casts and not inputs.prim.HasAPI(UsdLux.ShadowAPI):
+        inputs.warn("shadow:enable is used although ShadowAPI is not applied")
+    return casts
+
+
 def warn_of_unread(inputs: Inputs) -> None:
     """Name what a light asks for and this loader does not read.
 
@@ -229,10 +241,9 @@ def warn_of_unread(inputs: Inputs) -> None:
         Unreadable: An input has the wrong type or is not finite.
     """
     prim = inputs.prim
-    if prim.HasAPI(UsdLux.ShadowAPI):
-        color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
-        if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
-            inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
+    color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
+    if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
+        inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
     if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()):
         inputs.warn("light filters are not read")
 
