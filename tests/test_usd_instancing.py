@@ -253,7 +253,43 @@ def shared(monkeypatch):
 MOVED = 'double3 xformOp:translate = ({}, {}, {})\n uniform token[] xformOpOrder = ["xformOp:translate"]\n'
 CUBE = 'def Cube "{}" {{\n {}\n }}'
 TWO = "int[] protoIndices = [0, 0]\n point3f[] positions = [(0, 0, 0), (10, 0, 0)]"
+
+
+def reader(name: str, kind: str = "float3", varname: str = "tint") -> str:
+    """A material whose albedo is a primvar, (0.5, 0.5, 0.5) where there is none."""
+    grey = "(0.5, 0.5, 0.5)" if kind == "float3" else "0.5"
+    return f"""def Material "{name}" {{
+    token outputs:surface.connect = </{name}/S.outputs:surface>
+    def Shader "S" {{
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </{name}/R.outputs:result>
+        token outputs:surface
+    }}
+    def Shader "R" {{
+        uniform token info:id = "UsdPrimvarReader_{kind}"
+        string inputs:varname = "{varname}"
+        {kind} inputs:fallback = {grey}
+        {kind} outputs:result
+    }}
+}}
+"""
+
+
+BOUND = 'def Cube "{}" (prepend apiSchemas = ["MaterialBindingAPI"]) {{\n rel material:binding = </{}>\n {}\n }}'
+TINTS = 'color3f[] primvars:tint = [(1, 0, 0), (0, 1, 0)] (interpolation = "varying")'
 STAGES = {
+    "primvar that a material reads": reader("Look")
+    + instancer(
+        TWO + f"\n {TINTS}",
+        f"""def Xform "Proto" {{
+            {BOUND.format("A", "Look", "")}
+            {BOUND.format("B", "Look", "color3f[] primvars:tint = [(0, 0, 1)]")}
+            {CUBE.format("C", "")}
+            def PointInstancer "Q" {{ rel prototypes = </P/Proto/Q/D>\n {TWO}
+                {BOUND.format("D", "Look", "")}
+            }}
+        }}""",
+    ),
     "point": instancer(
         "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(0, 0, 0), (5, 0, 0), (0, 7, 0)]\n"
         "quatf[] orientationsf = [(1, 0, 0, 0), (0.6, 0, 0.8, 0), (0.8, 0.6, 0, 0)]\n"
@@ -340,6 +376,37 @@ def test_stored_once_is_the_same_as_written_out(tmp_path, name, monkeypatch):
     assert scene.warnings == flat.warnings and scene.materials == flat.materials
     assert scene.stats["triangles_seen"] == flat.stats["triangles"]
     assert scene.stats["prototype_places"] == sum(len(group.matrices) for group in scene.instances)
+
+
+@pytest.mark.parametrize(
+    ("kind", "primvar", "albedo"),
+    [
+        ("float3", TINTS, [(1, 0, 0), (0, 1, 0)]),
+        ("float3", "float3[] primvars:tint = [(0, 0, 1)]\nint[] primvars:tint:indices = [0, 0]", None),
+        ("float3", 'color3f[] primvars:tint = [(0, 0, 2)] (interpolation = "constant")', [(0, 0, 1)] * 2),
+        ("float", 'float[] primvars:tint = [0.25, 0.75] (interpolation = "vertex")', [(0.25,) * 3, (0.75,) * 3]),
+        ("float3", 'color3f[] primvars:tint = [(1, 0, 0)] (interpolation = "vertex")', None),
+    ],
+)
+def test_materials_read_primvars_of_instances(tmp_path, kind, primvar, albedo):
+    """A primvar of the instancer that the prototype lacks is each instance's own; with wrong counts it is named."""
+    text = reader("Look", kind) + BOUND.format("C", "Look", "")
+    text += f'\ndef PointInstancer "P" {{\n rel prototypes = </C>\n {TWO}\n {primvar}\n}}'
+    scene = load(tmp_path, text)
+    copies = next(mesh for mesh in scene.meshes if len(mesh.triangles) == 24)
+    if albedo is None:
+        assert copies.colors is None and warned(scene, "/P", "tint: not one finite")
+    else:
+        assert copies.colors[::12, 0].tolist() == [list(color) for color in albedo]
+        assert not warned(scene, "/P")
+
+
+def test_a_color_of_the_whole_instancer_reaches_prototypes_elsewhere(tmp_path):
+    """A constant displayColor of an instancer colours prototypes that do not inherit it, but not these themselves."""
+    color = "color3f[] primvars:displayColor = [(1, 0, 0)]"
+    text = f'def Cube "C" {{\n}}\ndef PointInstancer "P" {{\n rel prototypes = </C>\n {TWO}\n {color}\n}}'
+    meshes = {len(mesh.triangles): mesh for mesh in load(tmp_path, text).meshes}
+    assert meshes[24].colors.tolist() == [[[1, 0, 0]] * 3] * 24 and meshes[12].colors is None
 
 
 UVS = ((0.1, 0.2), (0.3, 0.4), (0.5, 0.7))

@@ -1,6 +1,6 @@
 """Gprims to meshes: each shape read once, given its look, and placed wherever it is drawn, or kept as a prototype."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,13 +13,14 @@ from warp_ir.usd.binding import PURPOSES
 from warp_ir.usd.glow import LAMP_UV, Lamp
 from warp_ir.usd.images import Images
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
-from warp_ir.usd.instancing import combined, combined_colors
+from warp_ir.usd.instancing import Level, combined, combined_colors
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.primvar import texture_coordinates
 from warp_ir.usd.report import Report, Unreadable
 from warp_ir.usd.shape import Mask, Shape, cross_products, place, without_slivers
 from warp_ir.usd.sharing import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share
+from warp_ir.usd.signal import Signal
 from warp_ir.usd.skel import Skinning, sharing_key
 from warp_ir.usd.tangents import smooth_tangents
 from warp_ir.usd.walk import LIGHT_COPIES, Site
@@ -96,6 +97,8 @@ class _Builder:
         self._seen: dict[tuple[object, ...], tuple[Shape, Look, bool]] = {}
         self._known: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
         self._lamps: dict[Sdf.Path, Lamp] = {}
+        self._painted: dict[tuple[int, Hashable], Level] = {}
+        self._dressed: dict[tuple[int, int], Look] = {}
 
     def run(self, sites: Sequence[Site]) -> Geometry:
         self._table.resolve([site.prim for site in sites])
@@ -165,7 +168,40 @@ class _Builder:
         self._report.stats["triangles_absent"] += absent * site.level.total
         if len(shape.triangles) == 0:
             return None
+        site, look = self._with_instance_primvars(site, look)
         return _Gprim(site, shape, look, emits or lamp is not None)
+
+    def _with_instance_primvars(self, site: Site, look: Look) -> tuple[Site, Look]:
+        """The gprim as its material has it, if that reads primvars which instancers give to each instance."""
+        levels = [self._paint(site.level, albedo) for _, albedo in look.asked]
+        found = [k for k, level in enumerate(levels) if any(each.colors is not None for each in level.chain())]
+        if not found:
+            return site, look
+        if len(found) > 1 or look.bare is not None:
+            path = site.prim.GetPath()
+            self._report.warn(path, "of materials that read primvars of instances, one is coloured by them")
+        key = (id(look), found[0])
+        if key not in self._dressed:
+            self._dressed[key] = replace(look, bare=look.asked[found[0]][0])
+        return replace(site, level=levels[found[0]]), self._dressed[key]
+
+    def _paint(self, level: Level, albedo: Signal) -> Level:
+        """A level with the colours that an albedo has in its places, and so all levels that it is in."""
+        if level.parent is None:
+            return level
+        key = (id(level), albedo.key)
+        if key not in self._painted:
+            colors: Floats | None = None
+            if level.primvars is not None:
+                read = {
+                    asked: level.primvars.read(asked.name, asked.channels, self._report) for asked in albedo.primvars
+                }
+                values = {asked: rows for asked, rows in read.items() if rows is not None}
+                if values:
+                    colors = np.broadcast_to(albedo.at(values), (len(level.matrices), 3)).clip(0.0, 1.0)
+            parent = self._paint(level.parent, albedo)
+            self._painted[key] = replace(level, key=(level.key, albedo.key), parent=parent, colors=colors)
+        return self._painted[key]
 
     def _lamp(self, site: Site) -> Lamp | None:
         """The light that a gprim is, if it is one."""

@@ -1,7 +1,7 @@
 """Where prototypes go: levels of instancing, and point instancers, whose arrays cannot be trusted."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +18,16 @@ from warp_ir.usd.shape import Mask
 class Level:
     """A prototype in all places that one native instance or point instancer gives it; the outermost is the world."""
 
-    key: Sdf.Path
+    key: Hashable
     """Of the prototype: levels with equal keys may hold the same."""
     parent: "Level | None"
     """The level in which the places are; None for the world."""
     matrices: Floats
     """parent_from_level, float64 [k, 4, 4]."""
     colors: Floats | None = None
-    """displayColor of each place, float64 [k, 3], if there are such; the prims' own is stronger."""
+    """Albedo of each place (displayColor), float64 [k, 3], if there are such; the prims' own is stronger."""
+    primvars: "InstancePrimvars | None" = None
+    """What else the instancer gives to each place."""
 
     @property
     def total(self) -> int:
@@ -66,6 +68,56 @@ def combined_colors(levels: Iterable[tuple[int, Floats | None]]) -> Floats | Non
 
 
 @dataclass(frozen=True, eq=False)
+class InstancePrimvars:
+    """The primvars of a point instancer, read when a material asks for them: most never are."""
+
+    prim: Usd.Prim
+    prototype: Sdf.Path
+    chosen: Mask
+    """Which instances are meant, bool [instances]."""
+    time: Usd.TimeCode
+
+    def read(self, name: str, channels: int, report: Report) -> Floats | None:
+        """A value for each of the k instances that are meant, float64 [k, c]; None if there are none.
+
+        Primvars that are vertex, varying or faceVarying have one per instance, the others one for all, which prims
+        below the instancer inherit anyway.
+        """
+        found = UsdGeom.PrimvarsAPI(self.prim).GetPrimvar(name)
+        if not found or not found.HasValue():
+            return None
+        single = found.GetInterpolation() in (UsdGeom.Tokens.constant, UsdGeom.Tokens.uniform)
+        if single and self.prototype.HasPrefix(self.prim.GetPath()):
+            return None
+        count = 1 if single else len(self.chosen)
+        try:
+            if channels == 1:
+                scalars = value.scalars(found.GetAttr(), self.time)
+                values = None if scalars is None else scalars[:, None]
+            else:
+                values = value.floats(found.GetAttr(), self.time, channels)
+            indices = value.ints(found.GetIndicesAttr(), self.time) if found.IsIndexed() else None
+        except Unreadable as trouble:
+            report.warn(self.prim.GetPath(), f"{trouble}; {name} ignored")
+            return None
+        if values is None or len(values) == 0:
+            return None
+        if indices is not None:
+            if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
+                report.warn(self.prim.GetPath(), f"{name}: an index is out of range; ignored")
+                return None
+            values = values[indices]
+        if len(values) != count or not np.isfinite(values).all():
+            what = "colour" if value.is_color(found.GetAttr()) else "value"
+            whom = "all instances" if single else f"each of {count} instances"
+            report.warn(self.prim.GetPath(), f"{name}: not one finite {what} for {whom}; ignored")
+            return None
+        if channels == 3 and value.is_color(found.GetAttr()):
+            values = value.to_linear_rec709(found.GetAttr(), values)
+        return values.repeat(int(self.chosen.sum()), axis=0) if single else values[self.chosen]
+
+
+@dataclass(frozen=True, eq=False)
 class Instances:
     """The visible instances of one prototype."""
 
@@ -74,6 +126,8 @@ class Instances:
     """instancer_from_instance, float64 [k, 4, 4]; the prototype's own transform comes before it."""
     colors: Floats | None
     """displayColor of each instance, float64 [k, 3], if there are such."""
+    primvars: InstancePrimvars
+    """All that the instancer gives to them."""
 
 
 def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[Instances]:
@@ -115,12 +169,15 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[I
     if not known.all():
         report.warn(prim.GetPath(), "{n} instances of prototypes that do not exist left out", int((~known).sum()))
     visible &= finite & known
-    colors = _colors(prim, count, time, report)
     groups = []
     for number, path in enumerate(prototypes):
         chosen = visible & (indices == number)
         if chosen.any():
-            groups.append(Instances(path, matrices[chosen], None if colors is None else colors[chosen]))
+            primvars = InstancePrimvars(prim, path, chosen, time)
+            colors = primvars.read("displayColor", 3, report)
+            groups.append(
+                Instances(path, matrices[chosen], None if colors is None else colors.clip(0.0, 1.0), primvars)
+            )
     return groups
 
 
@@ -180,27 +237,3 @@ def _mask(instancer: UsdGeom.PointInstancer, count: int, time: Usd.TimeCode, rep
     if hidden is not None:
         off = np.concatenate([off, hidden])
     return ~np.isin(ids, off)
-
-
-def _colors(prim: Usd.Prim, count: int, time: Usd.TimeCode, report: Report) -> Floats | None:
-    """A displayColor per instance: an instancer's vertex, varying and faceVarying primvars have one value each."""
-    found = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
-    if not found or not found.HasValue() or found.GetInterpolation() in ("constant", "uniform"):
-        return None
-    try:
-        values = value.floats(found.GetAttr(), time, 3)
-        indices = value.ints(found.GetIndicesAttr(), time) if found.IsIndexed() else None
-    except Unreadable as trouble:
-        report.warn(prim.GetPath(), f"{trouble}; displayColor ignored")
-        return None
-    if values is None or len(values) == 0:
-        return None
-    if indices is not None:
-        if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
-            report.warn(prim.GetPath(), "displayColor: an index is out of range; ignored")
-            return None
-        values = values[indices]
-    if len(values) != count or not np.isfinite(values).all():
-        report.warn(prim.GetPath(), f"displayColor: not one finite colour for each of {count} instances; ignored")
-        return None
-    return value.to_linear_rec709(found.GetAttr(), values).clip(0.0, 1.0)

@@ -37,12 +37,15 @@ class Look:
     """bool [m], triangles with neither material nor colour, that an instancer may still colour; None: none."""
     uvs: Mapping[str, Floats] = field(default_factory=dict)
     """float32 [m, 3, 2], the texture coordinates that the materials need, by name."""
+    asked: tuple[tuple[Mask, Signal], ...] = ()
+    """bool [m], triangles whose albedo depends on primvars that the prim lacks, and an instancer may have; and how."""
 
     def keep(self, mask: Mask) -> "Look":
         """The look of the triangles that a mask [m] selects."""
         colors = None if self.colors is None else self.colors[mask]
         uvs = {name: corners[mask] for name, corners in self.uvs.items()}
-        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask], uvs)
+        asked = tuple((which[mask], albedo) for which, albedo in self.asked)
+        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask], uvs, asked)
 
 
 class MaterialTable:
@@ -109,10 +112,13 @@ class MaterialTable:
         if not bare.any() and not asked:
             return Look(index)
         colors: Floats | None = None
+        lacking: list[tuple[Mask, Signal]] = []
         for k, surface in asked.items():
             chosen = index == k
             material = self.materials[k]
             color = self._from_primvars(prim, shape, surface.albedo, "albedo", 1.0)
+            if color is None and surface.albedo is not None and material.albedo_texture is None:
+                lacking.append((chosen, surface.albedo))
             if color is not None:
                 material = self._without_image(material, albedo_texture=None)
                 if color.ndim == 1:
@@ -123,8 +129,8 @@ class MaterialTable:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
         if not bare.any():
-            return Look(index, colors)
-        look = self._bare(prim, shape, index, bare)
+            return Look(index, colors, asked=tuple(lacking))
+        look = replace(self._bare(prim, shape, index, bare), asked=tuple(lacking))
         if colors is None:
             return look
         chosen = bare if look.colors is not None else np.zeros_like(bare)

@@ -237,6 +237,6 @@ class _Walk:
                 continue
             report.stats["point_instances"] += level.total * len(group.matrices)
             key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
-            inner = Level(key, level, local @ group.matrices, group.colors)
+            inner = Level(key, level, local @ group.matrices, group.colors, group.primvars)
             below.append(_Visit(prototype, inner, np.eye(4), purpose, (*visit.instancers, path)))
         return below
