@@ -67,7 +67,7 @@ def Scope "Render" {
     }
     def RenderProduct "P" {
         token productName = "/etc/../out/beauty.exr"
-        rel orderedVars = [</Render/C>, </Render/N>, </Render/Z>, </Render/Odd>]
+        rel orderedVars = [</Render/C>, </Render/N>, </Render/Z>, </Render/Odd>, </Render/Even>]
     }
     def RenderProduct "Q" {
         int2 resolution = (8, 4)
@@ -81,6 +81,8 @@ def Scope "Render" {
     def RenderVar "Z" { string sourceName = "depth"
     }
     def RenderVar "Odd" { string sourceName = "caustics"
+    }
+    def RenderVar "Even" { string sourceName = "sheen"
     }
 }
 """
@@ -108,7 +110,9 @@ def test_settings_become_ours(tmp_path):
     )  # fmt: skip
     assert scene.camera.name == "/B"
     assert warned(scene, "/Render/S", "warp_ir:wings", "no setting") and warned(scene, "/Render/S", "warp_ir:seed")
-    assert warned(scene, "/Render/S", "/Render/Gone") and warned(scene, "/Render/Odd", "caustics")
+    assert warned(scene, "/Render/S", "/Render/Gone") and warned(
+        scene, "/Render/Odd, /Render/Even", "'caustics', 'sheen'"
+    )
     assert warned(scene, "/Render/P", "/etc/../out/beauty.exr", "'beauty.exr'")
 
 

@@ -49,10 +49,12 @@ def test_wrong_arguments_are_input_errors(tmp_path, options):
 
 
 def test_an_empty_stage_loads(tmp_path, capfd):
-    """An empty stage is a scene: no geometry, the default dome, a framing camera; each is said."""
+    """An empty stage is a scene: no geometry, which is said, the default dome, a framing camera."""
     scene = load(tmp_path, "")
     assert scene.meshes == () and [light.kind for light in scene.lights] == [LightKind.DOME]
-    assert warned(scene, "no geometry") and warned(scene, "nothing emits") and warned(scene, "no camera")
+    assert scene.warnings == ("/: the stage draws no geometry",)
+    scene = load(tmp_path, f'def Mesh "M" {{{TRIANGLE}}}')
+    assert warned(scene, "nothing emits") and warned(scene, "no camera") and not warned(scene, "no geometry")
     assert scene.name == str(tmp_path / "stage.usda")
     assert capfd.readouterr() == ("", "")
 
@@ -76,8 +78,32 @@ def test_composition_errors_are_listed_once_and_not_spilled(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
     many = [f'def "A{k}" (references = @gone.usda@) {{\n}}' for k in range(9)]
     scene = load(tmp_path, "\n".join([*many, 'def "B" (references = @lost.usda@) {\n}']))
-    assert warned(scene, "gone.usda", "8 times more") and warned(scene, "lost.usda")
+    assert warned(scene, "/A0, ", "/A3 and 5 more", "gone.usda") and warned(scene, "lost.usda")
     assert sum("composition" in line for line in scene.warnings) == 2 and scene.stats["composition_errors"] == 10
+
+
+def test_a_missing_file_is_one_line_for_all_who_want_it(tmp_path):
+    """Prims that lack the same file share a line, in the order of their paths; who asks is named if not the root."""
+    (tmp_path / "part.usda").write_text('#usda 1.0\ndef "P" {\n def "Q" (payload = @lost.usda@) {\n}\n}')
+    prims = "".join(f'def "A{k}" (references = @gone.usda@) {{\n}}\n' for k in (2, 1, 3))
+    scene = load(tmp_path, prims + 'def "B" (references = @part.usda@</P>) {\n}\n')
+    gone = "/A1, /A2, /A3: composition: Could not open asset @gone.usda@ for reference"
+    assert [line for line in scene.warnings if "gone" in line] == [gone]
+    lost = [line for line in scene.warnings if "lost" in line]
+    assert len(lost) == 1 and lost[0].startswith("/B/Q: composition: ") and "part.usda@ asks for" in lost[0]
+
+
+def test_types_of_other_programs_are_named_in_one_line(tmp_path):
+    """Prims whose types USD does not know are no silent loss; what is below them, and fallback types, are drawn."""
+    foreign = (
+        f'def OtherSky "S" {{\n}}\ndef OtherGroup "G" {{\n def Mesh "M" {{{TRIANGLE}}}\n}}\ndef OtherSky "T" {{\n}}'
+    )
+    scene = load(tmp_path, foreign + '\ndef HoudiniLayerInfo "H" {\n}')
+    told = "/S, /G, /T: not rendered, for USD has no such types: OtherSky, OtherGroup"
+    assert [line for line in scene.warnings if "types" in line] == [told]
+    assert [mesh.name for mesh in scene.meshes] == ["/G/M"]
+    scene = load(tmp_path, '(fallbackPrimTypes = { token[] OtherSky = ["DomeLight"] })\ndef OtherSky "S" {\n}')
+    assert len(scene.lights) == 1 and scene.lights[0].name == "/S" and not warned(scene, "types")
 
 
 def test_metadata_of_the_wrong_kind_do_not_stop_the_load(tmp_path):

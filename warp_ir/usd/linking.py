@@ -5,11 +5,12 @@ from dataclasses import replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from pxr import Sdf, Usd, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Light, Mesh, MeshLight
 from warp_ir.usd import value
 from warp_ir.usd.render_pass import includes
+from warp_ir.usd.report import Report
 
 _Links = tuple[frozenset[int], frozenset[int]]
 """Unlit and shadowless meshes."""
@@ -19,7 +20,7 @@ _LINKED: WeakKeyDictionary[Mesh, Mesh] = WeakKeyDictionary()
 
 
 def link(
-    stage: Usd.Stage, lights: Sequence[Light], meshes: Sequence[Mesh]
+    stage: Usd.Stage, lights: Sequence[Light], meshes: Sequence[Mesh], report: Report
 ) -> tuple[tuple[Light, ...], tuple[Mesh, ...]]:
     """The lights, and the meshes that are lights, with their links to the meshes of a scene, all named by their paths.
 
@@ -27,6 +28,7 @@ def link(
         stage: Where the lights are.
         lights: Of the scene.
         meshes: Of the scene, in its order.
+        report: Where links to parts of meshes go: they are not followed.
     """
     known: dict[Any, frozenset[int]] = {}
 
@@ -35,8 +37,11 @@ def link(
         if not prim:
             return frozenset(), frozenset()
         api = UsdLux.LightAPI(prim)
-        unlit = _outside(api.GetLightLinkCollectionAPI(), meshes, known)
-        return unlit, _outside(api.GetShadowLinkCollectionAPI(), meshes, known)
+        collections = api.GetLightLinkCollectionAPI(), api.GetShadowLinkCollectionAPI()
+        if any(_names_subsets(stage, collection) for collection in collections if _says(collection)):
+            report.warn(light.name, "its links to face subsets are ignored: those of the whole mesh count")
+        unlit, shadowless = (_outside(collection, meshes, known) for collection in collections)
+        return unlit, shadowless
 
     linked = []
     for light in lights:
@@ -60,6 +65,12 @@ def _with_links(mesh: Mesh, links: _Links) -> Mesh:
 def _says(collection: Usd.CollectionAPI) -> bool:
     everything = value.flag(collection.GetIncludeRootAttr(), Usd.TimeCode.Default(), True)
     return not everything or collection.GetExcludesRel().HasAuthoredTargets()
+
+
+def _names_subsets(stage: Usd.Stage, collection: Usd.CollectionAPI) -> bool:
+    """Whether a collection tells parts of a mesh apart."""
+    targets = (*value.targets(collection.GetIncludesRel()), *value.targets(collection.GetExcludesRel()))
+    return any(prim.IsA(UsdGeom.Subset) for path in targets if (prim := stage.GetPrimAtPath(path.GetPrimPath())))
 
 
 def _outside(collection: Usd.CollectionAPI, meshes: Sequence[Mesh], known: dict[Any, frozenset[int]]) -> frozenset[int]:

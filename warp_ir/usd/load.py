@@ -265,7 +265,8 @@ class StageReader:
             dark += [self.stage.GetPrimAtPath(mesh.light.name) for mesh in meshes if mesh.light is not None]
             explain_dark_lights(dark, time, report)
             if self._default_light == "dome":
-                report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
+                if meshes:
+                    report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
                 lights = (_DOME,)
         stats = dict.fromkeys(_COUNTED, 0) | report.stats
         stats["meshes"], stats["materials"], stats["lights"] = len(meshes), len(materials), len(lights)
@@ -275,12 +276,13 @@ class StageReader:
         stats["instances"] = stats["native_instances"] + stats["point_instances"]
         stats["prototypes"] = len(geometry.instances)
         stats["prototype_places"] = sum(len(group.matrices) for group in geometry.instances)
-        lights, meshes = link(self.stage, lights, meshes)
+        lights, meshes = link(self.stage, lights, meshes, report)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
         if view is None:
-            along = "-Z" if self._axis == "Y" else "+Y"
-            report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
+            if meshes:
+                along = "-Z" if self._axis == "Y" else "+Y"
+                report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
             view = framing_camera(*scene.bounds(), self._axis)
         scene = replace(scene, camera=view, stats=stats)
         explain_blackness(scene, report)

@@ -207,6 +207,7 @@ def _snake(name: str) -> str:
 def _aovs(stage: Usd.Stage, product: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[str, ...]:
     """The AOVs that a product's orderedVars name, the colour apart."""
     found: dict[str, None] = {}
+    unknown: dict[Sdf.Path, str] = {}
     for path in value.targets(UsdRender.Product(product).GetOrderedVarsRel()):
         prim = stage.GetPrimAtPath(path)
         if not prim or not prim.IsA(UsdRender.Var):
@@ -219,10 +220,12 @@ def _aovs(stage: Usd.Stage, product: Usd.Prim, time: Usd.TimeCode, report: Repor
         name = source.lower()
         if name in _COLOR:
             continue
-        if name not in _AOVS:
-            report.warn(path, f"there is no variable '{source}' to write; left out")
-            continue
-        found[_AOVS[name]] = None
+        if name in _AOVS:
+            found[_AOVS[name]] = None
+        else:
+            unknown[path] = f"'{source}'"
+    for path in unknown:
+        report.warn(path, f"there is no variable {', '.join(dict.fromkeys(unknown.values()))} to write; left out")
     return tuple(found)
 
 

@@ -74,17 +74,42 @@ def open_stage(
             stage = _composed(instead[0], session, paths)
     except (Tf.ErrorException, RuntimeError) as error:
         raise _unopened(path, error) from None
-    errors = dict.fromkeys(_tidy(str(error)) for error in stage.GetCompositionErrors())
+    _name_composition_errors(stage, report)
+    return stage
+
+
+def _name_composition_errors(stage: Usd.Stage, report: Report) -> None:
+    """One line for each file that is missing and each other error, with the prims that lack something for it."""
+    # USD composes on all cores: the order is any.
+    found = {" ".join(str(error).split()): error for error in stage.GetCompositionErrors()}
+    errors = {text: found[text] for text in sorted(found)}
     causes: dict[str, list[str]] = {}
-    for text in errors:  # one file that is missing may be sought from many places
-        causes.setdefault(text.partition(" introduced by ")[0], []).append(text)
-    for texts in list(causes.values())[:_SHOWN]:
-        more = f" and {len(texts) - 1} times more" if len(texts) > 1 else ""
-        report.warn("/", f"composition: {texts[0].removesuffix('.')}{more}")
+    for text, error in errors.items():
+        causes.setdefault(_tidy(_cause(text, stage.GetRootLayer())), []).append(_path_of(error))
+    for text, paths in list(causes.items())[:_SHOWN]:
+        for path in paths:
+            report.warn(path, f"composition: {text}")
     if len(causes) > _SHOWN:
         report.warn("/", f"composition: {len(causes) - _SHOWN} more errors")
     report.stats["composition_errors"] = len(errors)
-    return stage
+
+
+def _cause(text: str, root: Sdf.Layer) -> str:
+    """What is wrong, without the prim, and without the layer that says so if it is the root."""
+    found = re.search(r" introduced by @([^@]*)@<[^>]*>", text)
+    if found is None:
+        return text
+    rest = text[: found.start()] + text[found.end() :].removesuffix(".")
+    return rest if found[1] in (root.identifier, root.realPath) else f"{rest}, which @{found[1]}@ asks for"
+
+
+def _path_of(error: object) -> str:
+    """The prim of the stage where something is missing."""
+    try:
+        path = str(error.rootSite.path)  # type: ignore[attr-defined]
+    except AttributeError:
+        return "/"
+    return path or "/"
 
 
 def _composed(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.Stage:

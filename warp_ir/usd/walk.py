@@ -1,6 +1,5 @@
 """The walk over a stage: which gprims and lights are drawn, and where; instances included."""
 
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
@@ -19,6 +18,10 @@ _DEPTH = 16
 """Deepest nesting of point instancers that is followed."""
 LIGHT_COPIES = 100_000
 """Most copies of one light."""
+_FOREIGN = 6
+"""How many types of other programs are named."""
+_NOTES = ("HoudiniLayerInfo",)
+"""Types of other programs that are no part of a scene."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
 _WORLD = Level(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
@@ -93,7 +96,7 @@ class _Walk:
         self._pass = render_pass
         self._transforms = UsdGeom.XformCache(time)
         self._found = Found()
-        self._unread: Counter[str] = Counter()
+        self._foreign: dict[Sdf.Path, str] = {}
         self._lamps: list[Usd.Prim] = []
 
     def run(self) -> Found:
@@ -102,6 +105,7 @@ class _Walk:
         while pending:  # a stack of our own: hierarchies may be deeper than Python's
             pending += reversed(self._visit(pending.pop()))
         self._light_geometry()
+        self._name_foreign()
         return self._found
 
     def _visit(self, visit: _Visit) -> list[_Visit]:
@@ -124,6 +128,8 @@ class _Walk:
             report.stats["native_instances"] += 1
             level, local = Level(prim.GetPrototype().GetPath(), level, local[None]), np.eye(4)
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        if not kind and prim.GetTypeName() not in ("", *_NOTES):
+            self._foreign[prim.GetPath()] = prim.GetTypeName()
         site = Site(prim, level, local)
         if kind == "PointInstancer":
             if not self._takes_part(prim):
@@ -149,7 +155,7 @@ class _Walk:
         elif kind in ("LightFilter", "PluginLightFilter"):
             report.warn(prim.GetPath(), "light filters are not read")
         elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
-            report.warn(prim.GetPath(), f"{kind} is not read yet: it emits nothing")
+            report.warn(prim.GetPath(), f"{kind or prim.GetTypeName()} is not read yet: it emits nothing")
         if prim.HasAPI(UsdGeom.ModelAPI):
             mode = value.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
             if mode not in ("inherited", "default"):
@@ -201,6 +207,13 @@ class _Walk:
             self._report.warn(site.prim.GetPath(), f"{site.level.total} copies of a light: too many, it is left out")
         else:
             self._found.lights.append(site)
+
+    def _name_foreign(self) -> None:
+        """Names prims whose types USD does not know, and nobody says what to draw instead (fallbackPrimTypes)."""
+        types = list(dict.fromkeys(self._foreign.values()))
+        more = f" and {len(types) - _FOREIGN} more" if len(types) > _FOREIGN else ""
+        for path in self._foreign:
+            self._report.warn(path, f"not rendered, for USD has no such types: {', '.join(types[:_FOREIGN])}{more}")
 
     def _light_geometry(self) -> None:
         """Gives gprims to the deprecated GeometryLights that refer to them."""
