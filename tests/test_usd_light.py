@@ -529,6 +529,8 @@ def Xform "Geom" {
         ("rel collection:lightLink:excludes = </Geom/c>", {2}, set()),
         ("rel collection:shadowLink:excludes = [</Geom/a>, </Geom/b>]", set(), {0, 1}),
         ("uniform bool collection:lightLink:includeRoot = 0", {0, 1, 2}, set()),
+        ('uniform token collection:lightLink:expansionRule = "explicitOnly"', {0, 1, 2}, set()),
+        ("rel collection:lightLink:includes = </Geom/a>", set(), set()),
     ],
 )
 def test_links_are_read(tmp_path, more, unlit, shadowless):

@@ -15,6 +15,9 @@ from warp_ir.usd.report import Report
 _Links = tuple[frozenset[int], frozenset[int]]
 """Unlit and shadowless meshes."""
 
+_EVERYTHING = {Sdf.Path.absoluteRootPath: Usd.Tokens.expandPrims}
+"""What a collection is that has all prims."""
+
 # A mesh that does not move is the same object at all times, linked or not.
 _LINKED: WeakKeyDictionary[Mesh, Mesh] = WeakKeyDictionary()
 
@@ -63,8 +66,8 @@ def _with_links(mesh: Mesh, links: _Links) -> Mesh:
 
 
 def _says(collection: Usd.CollectionAPI) -> bool:
-    everything = value.flag(collection.GetIncludeRootAttr(), Usd.TimeCode.Default(), True)
-    return not everything or collection.GetExcludesRel().HasAuthoredTargets()
+    """Whether a file says anything of a collection; if not, it has everything."""
+    return bool(collection.GetPrim().GetAuthoredPropertiesInNamespace(f"collection:{collection.GetName()}"))
 
 
 def _names_subsets(stage: Usd.Stage, collection: Usd.CollectionAPI) -> bool:
@@ -78,8 +81,11 @@ def _outside(collection: Usd.CollectionAPI, meshes: Sequence[Mesh], known: dict[
     if not _says(collection):
         return frozenset()
     query = collection.ComputeMembershipQuery()
-    rules = frozenset((str(path), str(rule)) for path, rule in query.GetAsPathExpansionRuleMap().items())
-    key = rules, query.UsesPathExpansionRuleMap() or str(collection.ResolveCompleteMembershipExpression())
+    rules = query.GetAsPathExpansionRuleMap()
+    if rules == _EVERYTHING:
+        return frozenset()
+    written = frozenset((str(path), str(rule)) for path, rule in rules.items())
+    key = written, query.UsesPathExpansionRuleMap() or str(collection.ResolveCompleteMembershipExpression())
     if key not in known:
         known[key] = frozenset(k for k, mesh in enumerate(meshes) if not includes(query, Sdf.Path(mesh.name)))
     return known[key]
