@@ -233,6 +233,14 @@ def test_colors_per_instance(tmp_path):
     assert scene.meshes[0].colors is None and scene.materials[0].albedo == (0, 0, 1)
 
 
+def test_opacities_of_instances_are_named(tmp_path):
+    """A displayOpacity per instance is not honoured, and said, unless it is 1 throughout."""
+    arrays = "int[] protoIndices = [0, 0]\n point3f[] positions = [(0, 0, 0), (1, 0, 0)]\n"
+    opacity = 'float[] primvars:displayOpacity = [1, {}] (interpolation = "varying")'
+    assert warned(load(tmp_path, instancer(arrays + opacity.format(0.5))), "/P", "displayOpacity per instance")
+    assert not warned(load(tmp_path, instancer(arrays + opacity.format(1))), "displayOpacity")
+
+
 def test_a_scene_that_cannot_fit_is_refused_before_it_is_allocated(tmp_path):
     """Nested instancers that multiply to thousands of millions are an input error."""
     many = f"int[] protoIndices = {[0] * 3000}\n point3f[] positions = {[(0, 0, 0)] * 3000}"

@@ -169,6 +169,10 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[I
     if not known.all():
         report.warn(prim.GetPath(), "{n} instances of prototypes that do not exist left out", int((~known).sum()))
     visible &= finite & known
+    opacity = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayOpacity")
+    if opacity and opacity.GetInterpolation() not in (UsdGeom.Tokens.constant, UsdGeom.Tokens.uniform):
+        if np.any(np.asarray(value.raw(opacity.GetAttr(), time)) != 1.0):
+            report.warn(prim.GetPath(), "displayOpacity per instance is not read: instances are opaque")
     groups = []
     for number, path in enumerate(prototypes):
         chosen = visible & (indices == number)
