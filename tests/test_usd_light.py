@@ -196,6 +196,26 @@ def test_inputs_without_prefix_are_read(tmp_path):
     assert scene.lights[0].radius == 2.0 and not warned(scene, "/L")
 
 
+def test_inputs_may_be_connected_to_interfaces(tmp_path):
+    """A connection to an input of another prim gives its value; one to a shader is named, and the own value counts."""
+    text = """def Material "Rig" {
+    float inputs:dimmer = 7
+}
+def Shader "Noise" {
+    color3f outputs:rgb
+}
+def SphereLight "L" {
+    float inputs:intensity = 1
+    float inputs:intensity.connect = </Rig.inputs:dimmer>
+    color3f inputs:color = (1, 0.5, 0.25)
+    color3f inputs:color.connect = </Noise.outputs:rgb>
+}
+"""
+    scene = load(tmp_path, text)
+    assert scene.lights[0].radiance == (7.0, 3.5, 1.75)
+    assert warned(scene, "/L", "inputs:color", "shader") and not warned(scene, "intensity")
+
+
 SHAPED = '(prepend apiSchemas = ["ShapingAPI"])'
 SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
 
@@ -210,6 +230,7 @@ SHADOWS = '(prepend apiSchemas = ["ShadowAPI"])'
         ("DiskLight", "", "asset inputs:texture:file = @a.png@", "only rectangles and domes"),
         ("RectLight", SHADOWS, "color3f inputs:shadow:color = (1, 0, 0)", "shadows are not read"),
         ("RectLight", "", "rel light:filters = </L>", "filters"),
+        ("RectLight", "", "rel filters = </L>", "filters"),
         ("PortalLight", "", "", "portals"),
         ("GeometryLight", "", "", "geometry"),
         ("PluginLight", "", "", "PluginLight"),

@@ -1,6 +1,6 @@
 """The inputs of a light."""
 
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from warp_ir.usd import value
 from warp_ir.usd.report import Report
@@ -21,13 +21,23 @@ class Inputs:
         self._may_be_old = not prim.IsA(UsdGeom.Gprim)
 
     def attribute(self, name: str) -> Usd.Attribute:
-        """The attribute that holds an input."""
+        """The attribute that holds an input; where it is connected to an interface, the one that it leads to."""
         current = self.prim.GetAttribute(f"inputs:{name}")
         old = self.prim.GetAttribute(name)
         if self._may_be_old and old and old.HasAuthoredValue() and not (current and current.HasAuthoredValue()):
             self.warn("inputs authored in the old style, without 'inputs:', are used")
             return old
+        if current and current.HasAuthoredConnections():
+            return self._source(current)
         return current
+
+    def _source(self, connected: Usd.Attribute) -> Usd.Attribute:
+        """What gives an input its value, unless that is a shader."""
+        found = UsdShade.Utils.GetValueProducingAttributes(UsdShade.Input(connected))
+        if len(found) == 1 and UsdShade.Input.IsInput(found[0]):
+            return found[0]
+        self.warn(f"{connected.GetName()}: the shader that it is connected to is not read; its own value counts")
+        return connected
 
     def authored(self, *names: str) -> bool:
         """Whether a file gives a value to any of these inputs."""

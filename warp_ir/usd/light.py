@@ -244,7 +244,8 @@ def warn_of_unread(inputs: Inputs) -> None:
     color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
     if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
         inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
-    if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()):
+    old = prim.GetRelationship("filters")
+    if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()) or (old and value.targets(old)):
         inputs.warn("light filters are not read")
 
 
