@@ -233,6 +233,26 @@ def test_colors_per_instance(tmp_path):
     assert scene.meshes[0].colors is None and scene.materials[0].albedo == (0, 0, 1)
 
 
+@pytest.mark.parametrize(
+    ("above", "of_instancer", "drawn"),
+    [("", "", 1), ("", "proxy", 0), ("proxy", "", 0), ("render", "proxy", 1), ("proxy", "render", 0)],
+)
+def test_prototypes_inherit_purposes_where_they_lie(tmp_path, above, of_instancer, drawn):
+    """A purpose above a prototype is its own, without one the instancer's counts; visibility above it does not."""
+    above, of_instancer = (f'uniform token purpose = "{name}"' if name else "" for name in (above, of_instancer))
+    text = f"""def Scope "Hidden" {{
+    token visibility = "invisible"
+    {above}
+    def Mesh "M" {{{TRIANGLE}}}
+}}
+def PointInstancer "P" {{
+    {of_instancer}
+    rel prototypes = </Hidden/M>
+    {TWO}
+}}"""
+    assert len(load(tmp_path, text).meshes) == drawn
+
+
 def test_opacities_of_instances_are_named(tmp_path):
     """A displayOpacity per instance is not honoured, and said, unless it is 1 throughout."""
     arrays = "int[] protoIndices = [0, 0]\n point3f[] positions = [(0, 0, 0), (1, 0, 0)]\n"

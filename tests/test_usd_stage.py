@@ -272,3 +272,18 @@ def test_some_real_files_survive():
 def test_every_real_file_survives(file):
     """Any file loads into consistent records, or is refused in one line."""
     _survives(file)
+
+
+def test_visibility_of_purposes(tmp_path):
+    """VisibilityAPI: the nearest authored opinion counts for each purpose; guides are hidden without one."""
+    pair = 'def Cube "{}g" {{\n uniform token purpose = "guide"\n}}\n'
+    pair += 'def Cube "{}r" {{\n uniform token purpose = "render"\n}}\n'
+    head = 'apiSchemas = ["VisibilityAPI"]'
+    text = (
+        pair.format("a", "a")
+        + f'def Xform "X" ({head}) {{\n token renderVisibility = "invisible"\n token guideVisibility = "visible"\n'
+        + pair.format("b", "b")
+        + f'def Xform "Y" ({head}) {{\n token renderVisibility = "visible"\n{pair.format("c", "c")}}}\n}}\n'
+    )
+    scene = load(tmp_path, text, purposes=("render", "guide"))
+    assert [mesh.name for mesh in scene.meshes] == ["/ar", "/X/bg", "/X/Y/cg", "/X/Y/cr"]

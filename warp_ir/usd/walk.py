@@ -188,11 +188,9 @@ class _Walk:
             self._report.stats["prims_other_purpose"] += 1
             self._report.stats[f"prims_{purpose}"] += 1
             return False
-        if purpose != UsdGeom.Tokens.default_:
-            effective = UsdGeom.Imageable(prim).ComputeEffectiveVisibility(purpose, self._time)
-            if effective == UsdGeom.Tokens.invisible:
-                self._report.stats["prims_invisible"] += 1
-                return False
+        if purpose != UsdGeom.Tokens.default_ and self._hides(prim, purpose):
+            self._report.stats["prims_invisible"] += 1
+            return False
         return self._takes_part(prim)
 
     def _takes_part(self, prim: Usd.Prim) -> bool:
@@ -201,6 +199,17 @@ class _Walk:
             return True
         self._report.stats["prims_outside_pass"] += 1
         return False
+
+    def _hides(self, prim: Usd.Prim, purpose: str) -> bool:
+        """What the nearest VisibilityAPI says of a purpose; visibility itself, which need not be inherited, apart."""
+        while prim and not prim.IsPseudoRoot():
+            if prim.HasAPI(UsdGeom.VisibilityAPI):
+                attribute = UsdGeom.VisibilityAPI(prim).GetPurposeVisibilityAttr(purpose)
+                says = value.text(attribute, self._time) if attribute and attribute.HasAuthoredValue() else ""
+                if says in (UsdGeom.Tokens.visible, UsdGeom.Tokens.invisible):
+                    return bool(says == UsdGeom.Tokens.invisible)
+            prim = prim.GetParent()
+        return bool(purpose == UsdGeom.Tokens.guide)
 
     def _add_light(self, site: Site) -> None:
         if site.level.total > LIGHT_COPIES:
@@ -251,5 +260,8 @@ class _Walk:
             report.stats["point_instances"] += level.total * len(group.matrices)
             key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
             inner = Level(key, level, local @ group.matrices, group.colors, group.primvars)
-            below.append(_Visit(prototype, inner, np.eye(4), purpose, (*visit.instancers, path)))
+            # What lies above a prototype gives it no place and hides it not, but a purpose.
+            own = UsdGeom.Imageable(prototype).ComputePurposeInfo() if prototype.IsA(UsdGeom.Imageable) else None
+            inherited = own if own is not None and own.isInheritable else purpose
+            below.append(_Visit(prototype, inner, np.eye(4), inherited, (*visit.instancers, path)))
         return below
