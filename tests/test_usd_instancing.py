@@ -189,7 +189,7 @@ def test_a_prototype_that_contains_its_instancer_does_not_loop(tmp_path):
     }}
 }}""",
     )
-    assert len(scene.meshes) == 1 and warned(scene, "/A/P", "contains the instancer itself")
+    assert len(scene.meshes) == 1 and warned(scene, "/A/P", "holds the instancer itself")
 
 
 def test_arrays_of_wrong_length_are_named_and_ignored(tmp_path):

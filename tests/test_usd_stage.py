@@ -230,8 +230,10 @@ def test_draw_modes_are_named_and_ignored(tmp_path):
     }
 }
 """
-    scene = load(tmp_path, text % ("A", "cards") + text % ("B", "default"))
+    instancer = (text % ("P", "bounds")).replace("Xform", "PointInstancer")
+    scene = load(tmp_path, text % ("A", "cards") + text % ("B", "default") + instancer)
     assert len(scene.meshes) == 2 and warned(scene, "/A", "cards") and not warned(scene, "/B")
+    assert warned(scene, "/P", "bounds")
 
 
 def test_types_that_are_not_rendered_are_named_once_with_their_count(tmp_path):

@@ -73,8 +73,10 @@ class InstancePrimvars:
 
     prim: Usd.Prim
     prototype: Sdf.Path
-    chosen: Mask
-    """Which instances are meant, bool [instances]."""
+    count: int
+    """Instances that there are."""
+    chosen: Ints
+    """Which of them are meant, int [k]."""
     time: Usd.TimeCode
 
     def read(self, name: str, channels: int, report: Report) -> Floats | None:
@@ -89,7 +91,7 @@ class InstancePrimvars:
         single = found.GetInterpolation() in (UsdGeom.Tokens.constant, UsdGeom.Tokens.uniform)
         if single and self.prototype.HasPrefix(self.prim.GetPath()):
             return None
-        count = 1 if single else len(self.chosen)
+        count = 1 if single else self.count
         try:
             if channels == 1:
                 scalars = value.scalars(found.GetAttr(), self.time)
@@ -114,7 +116,7 @@ class InstancePrimvars:
             return None
         if channels == 3 and value.is_color(found.GetAttr()):
             values = value.to_linear_rec709(found.GetAttr(), values)
-        return values.repeat(int(self.chosen.sum()), axis=0) if single else values[self.chosen]
+        return values.repeat(len(self.chosen), axis=0) if single else values[self.chosen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +177,9 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[I
             report.warn(prim.GetPath(), "displayOpacity per instance is not read: instances are opaque")
     groups = []
     for number, path in enumerate(prototypes):
-        chosen = visible & (indices == number)
-        if chosen.any():
-            primvars = InstancePrimvars(prim, path, chosen, time)
+        chosen = np.flatnonzero(visible & (indices == number)).astype(np.int32)
+        if len(chosen):
+            primvars = InstancePrimvars(prim, path, count, chosen, time)
             colors = primvars.read("displayColor", 3, report)
             groups.append(
                 Instances(path, matrices[chosen], None if colors is None else colors.clip(0.0, 1.0), primvars)

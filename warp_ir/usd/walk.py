@@ -130,6 +130,10 @@ class _Walk:
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if not kind and prim.GetTypeName() not in ("", *_NOTES):
             self._foreign[prim.GetPath()] = prim.GetTypeName()
+        if prim.HasAPI(UsdGeom.ModelAPI):
+            mode = value.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
+            if mode not in ("inherited", "default"):
+                report.warn(prim.GetPath(), f"draw mode '{mode}' is not honoured: the geometry itself is drawn")
         site = Site(prim, level, local)
         if kind == "PointInstancer":
             if not self._takes_part(prim):
@@ -156,10 +160,6 @@ class _Walk:
             report.warn(prim.GetPath(), "light filters are not read")
         elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
             report.warn(prim.GetPath(), f"{kind or prim.GetTypeName()} is not read yet: it emits nothing")
-        if prim.HasAPI(UsdGeom.ModelAPI):
-            mode = value.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
-            if mode not in ("inherited", "default"):
-                report.warn(prim.GetPath(), f"draw mode '{mode}' is not honoured: the geometry itself is drawn")
         children = prim.GetFilteredChildren(_PROTOTYPE if visit.instancers else _DRAWN)
         if children and "LODRootAPI" in prim.GetAppliedSchemas():
             # Levels of detail exclude each other; who cannot choose shows the default one.
@@ -255,7 +255,9 @@ class _Walk:
                 report.warn(path, f"its prototype {group.prototype} does not exist")
                 continue
             if any(used.HasPrefix(group.prototype) for used in (*visit.instancers, path)):
-                report.warn(path, f"its prototype {group.prototype} contains the instancer itself; left out")
+                report.warn(
+                    path, f"its prototype {group.prototype} holds the instancer itself, or leads back to it; left out"
+                )
                 continue
             report.stats["point_instances"] += level.total * len(group.matrices)
             key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
