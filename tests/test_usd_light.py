@@ -388,6 +388,11 @@ def test_photometry_scales_and_normalizes(tmp_path):
     assert (profile(tmp_path, up) > 50).sum() == pytest.approx(60 / 180 * len(wide), abs=1)
     narrow = profile(tmp_path, up, "float inputs:shaping:ies:angleScale = -0.5")
     assert (narrow > 50).sum() == pytest.approx(30 / 180 * len(wide), abs=1) and narrow[-1, 0] == pytest.approx(100)
+    # About the other pole, θ_ies = 2 θ - 180°, and no less than 0: bright up to θ = 120°.
+    spread = profile(tmp_path, file, "float inputs:shaping:ies:angleScale = -0.5")
+    assert (spread > 50).sum() == pytest.approx((90 + 30) / 180 * len(wide), abs=1) and spread[0, 0] == 100
+    none = light_text("SphereLight", IES + "float inputs:shaping:ies:angleScale = 1e-15", SHAPED)
+    assert warned(load(tmp_path, none), "/L", "nothing of the profile is left")
     # 100 cd in a cone of 60°: 100 · 2π (1 - cos 60°) / 2π = 50 in the mean of the hemisphere.
     assert profile(tmp_path, file, "bool inputs:shaping:ies:normalize = true").max() == pytest.approx(2.0, rel=5e-3)
 

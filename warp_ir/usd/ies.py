@@ -22,7 +22,8 @@ def read_profile(asset: Sdf.AssetPath, angle_scale: float, normalize: bool) -> F
     Args:
         asset: Of an .ies file. In type C the light's axis is where polar angles begin; in types A and B (of headlamps
             and floodlights) it is where the lamp is aimed, +Y is up and +X is on the right of one who stands behind it.
-        angle_scale: ShapingAPI's ies:angleScale: θ_ies = θ / scale, or (θ - π) / -scale + π if it is negative.
+        angle_scale: ShapingAPI's ies:angleScale: θ_ies = θ / scale, or (θ - π) / -scale + π if it is negative,
+            clamped to [0, π] as the reference renderer of OpenUSD does.
         normalize: Whether to divide by the profile's mean over the sphere (over the hemisphere, if it ends there), as
             the reference renderer of OpenUSD does.
 
@@ -55,7 +56,7 @@ def read_profile(asset: Sdf.AssetPath, angle_scale: float, normalize: bool) -> F
     scaled = rows
     if angle_scale != 0.0:
         scaled = rows / angle_scale if angle_scale > 0.0 else (rows - 180.0) / -angle_scale + 180.0
-    return table(scaled) / mean
+    return table(scaled.clip(0.0, 180.0)) / mean
 
 
 def _bytes(asset: Sdf.AssetPath) -> bytes:

@@ -40,6 +40,8 @@ def read_shaping(inputs: Inputs, kind: LightKind) -> Shaping | None:
             profile = read_profile(asset, scale, inputs.flag("shaping:ies:normalize"))
         except Unreadable as trouble:
             inputs.warn(f"shaping:ies:file: {trouble}; the light is rendered without it")
+        if profile is not None and not profile.any():
+            inputs.warn("shaping:ies: nothing of the profile is left with this angleScale: the light emits nothing")
     # Flat lights emit into a hemisphere anyway, whose edge a sharp cone of 90° is, and suns into their angle.
     whole = 90.0 if kind in (LightKind.RECT, LightKind.DISK, LightKind.DISTANT) else 180.0
     if kind == LightKind.DISTANT and inputs.number("angle", 0.53) > 180.0:
