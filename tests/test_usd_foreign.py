@@ -1,5 +1,7 @@
 """Shaders of other renderers: what of them a diffuse surface shows."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -223,3 +225,75 @@ def test_gltf_images(tmp_path, image):
     np.testing.assert_allclose(material.opacity_texture.pixels[..., 0], 0.5 * image[..., 3], atol=2.0**-11)
     # KHR_texture_transform: (u, 1 - v) -> scale (u, 1 - v) + offset.
     np.testing.assert_allclose(material.albedo_texture.transform, [[2, 0, 0.5], [0, 2, -1.25]])
+
+
+MODULE = """mdl 1.4;
+import ::OmniPBR::OmniPBR; // "not a string
+/* export material Oak(*) = OmniPBR(albedo_add: 9.f); */
+export material Pine(*) = OmniPBR(diffuse_color_constant: color(1.f));
+export material Oak(*)
+[[ anno::display_name("Oak, (light)"), anno::author("//x") ]]
+ = ::OmniPBR::OmniPBR(
+    diffuse_color_constant: color(0.5f, 0.25f, .125f), // of the core
+    TEXTURE
+    albedo_brightness: 0.5f,
+    enable_emission: true, emissive_color: color(1, 2, 4), emissive_intensity: 3.e0f,
+    texture_scale: float2(2.f, 3.f),
+    bump_factor: math::pow(2.f, 3.f),
+    opacity_mode: ::base::mono_average);
+"""
+
+
+@pytest.fixture
+def oak(tmp_path):
+    """A library with a material and a texture."""
+    (tmp_path / "lib").mkdir()
+    write(tmp_path / "lib" / "a.png", RGBA)
+    (tmp_path / "lib" / "Oak.mdl").write_text(MODULE.replace("TEXTURE", ""))
+    return tmp_path
+
+
+def library(inputs="", name="Oak"):
+    return mdl(inputs, name).replace(f"@{name}.mdl@", "@lib/Oak.mdl@") + mesh()
+
+
+def test_a_material_of_a_library(oak):
+    """Its arguments are in the file, and what the stage says of it is stronger."""
+    material = only_material(load(oak, library()))
+    assert material.albedo == (0.5, 0.25, 0.125)
+    assert material.emission == pytest.approx(np.array((3.0, 6.0, 12.0)) / np.pi)
+    assert only_material(load(oak, library(name="Pine"))).albedo == (1.0, 1.0, 1.0)
+    material = only_material(load(oak, library("bool inputs:enable_emission = 0")))
+    assert material.albedo == (0.5, 0.25, 0.125) and material.emission == (0.0, 0.0, 0.0)
+
+
+def test_a_texture_of_a_library(oak, image):
+    """It lies beside the .mdl file, which says what it holds."""
+    texture = 'diffuse_texture: texture_2d("./a.png", ::tex::gamma_linear),'
+    (oak / "lib" / "Oak.mdl").write_text(MODULE.replace("TEXTURE", texture))
+    found = only_material(load(oak, library())).albedo_texture
+    np.testing.assert_allclose(found.pixels, 0.5 * image[..., :3], atol=2.0**-11)
+    np.testing.assert_allclose(found.transform, [[2, 0, 0], [0, 3, 0]])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "export material Oak(*) = Wood(diffuse_color_constant: color(1.f));",
+        "export material Oak(float a = 1.f) = OmniPBR(diffuse_color_constant: color(1.f));",
+        "export material Oak(*) = OmniPBR(diffuse_color_constant: color(1e999f)",
+        "export material Oak(*) = OmniPBR(a: " + "1" * 100_000 + "x)",
+        "export material Oak(*) [[" * 5000,
+        "/*" * 60_000,
+        '"\\' * 60_000,
+        "export material Oak(*) = OmniPBR(" * 3000,
+        "x" * 2**18,
+        "\0\xff",
+    ],
+)
+def test_files_that_are_something_else_are_harmless(oak, text):
+    """What is not of this form, or no text, leaves what the stage itself says, within moments."""
+    (oak / "lib" / "Oak.mdl").write_text(text)
+    begin = time.perf_counter()
+    scene = load(oak, library("color3f inputs:diffuse_color_constant = (0.5, 0.25, 0.125)"))
+    assert only_material(scene).albedo == (0.5, 0.25, 0.125) and time.perf_counter() - begin < 10.0

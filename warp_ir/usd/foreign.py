@@ -1,8 +1,9 @@
 """Surface shaders of other renderers, as far as a diffuse surface shows them: base colour, glow and opacity.
 
 OmniPBR and OmniSurface are MDL by NVIDIA; their inputs and defaults are those of the Omniverse materials reference, and
-their emission is a radiant exitance, as it is in MDL unless a material says otherwise: radiance times pi. Of any other
-shader those inputs count that renderers commonly call so.
+their emission is a radiant exitance, radiance times pi, as it is in MDL unless a material says otherwise. `mdl.py`
+finds them in files that call them with arguments. Of any other shader those inputs count that renderers commonly
+call so.
 """
 
 import math
@@ -11,10 +12,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pxr import UsdLux, UsdShade
+from pxr import Sdf, UsdLux, UsdShade
 
 from warp_ir.scene import Color, Floats
-from warp_ir.usd.signal import Signal, combine, constant
+from warp_ir.usd.mdl import Call, read_call
+from warp_ir.usd.signal import Signal, as_color, combine, constant
 
 _BLACK: Color = (0.0, 0.0, 0.0)
 _WHITE: Color = (1.0, 1.0, 1.0)
@@ -44,8 +46,55 @@ class Inputs(Protocol):
     def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
         """The image that an input names; None where it names none."""
 
+    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+        """An image; None where it cannot be read."""
+
     def warn(self, what: str) -> None:
         """Say something about the material."""
+
+
+class _Called:
+    """The inputs of a shader whose defaults are the arguments of a `Call`.
+
+    Args:
+        inputs: Of the shader; what they have comes first.
+        call: In the file that the shader is in.
+    """
+
+    def __init__(self, inputs: Inputs, call: Call) -> None:
+        self._inputs, self._call = inputs, call
+        self.warn, self.file = inputs.warn, inputs.file
+
+    def _numbers(self, name: str) -> tuple[float, ...] | None:
+        return None if self._inputs.has(name) else self._call.numbers.get(name)
+
+    def has(self, name: str) -> bool:
+        return self._inputs.has(name) or name in {**self._call.numbers, **self._call.files, **self._call.words}
+
+    def color(self, name: str, default: Color) -> Signal:
+        found = self._numbers(name)
+        return self._inputs.color(name, default) if found is None else as_color(constant(*found))
+
+    def grey(self, name: str, default: float) -> Signal:
+        found = self._numbers(name)
+        return self._inputs.grey(name, default) if found is None else constant(found[0])
+
+    def number(self, name: str, default: float) -> float:
+        found = self._numbers(name)
+        return self._inputs.number(name, default) if found is None else found[0]
+
+    def pair(self, name: str, default: float) -> tuple[float, float]:
+        found = self._numbers(name)
+        return self._inputs.pair(name, default) if found is None else (found[0], found[-1])
+
+    def word(self, name: str) -> str:
+        return self._inputs.word(name) or self._call.words.get(name, "")
+
+    def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
+        if self._inputs.has(name) or name not in self._call.files:
+            return self._inputs.picture(name, channels, uv, transform, color=color)
+        asset, space = self._call.files[name]
+        return self.file(asset, channels, space if color else "raw", uv, transform)
 
 
 @dataclass(frozen=True)
@@ -76,14 +125,31 @@ def shader_name(shader: UsdShade.Shader) -> str:
 def reader_of(shader: UsdShade.Shader) -> Callable[[Inputs], Terms | None] | None:
     """What reads a shader, by its name or by inputs that only it has; None for one that nothing here is known of."""
     name = shader_name(shader)
+    asset = shader.GetSourceAsset("mdl")
+    call = read_call(asset, name) if asset and not shader.GetShaderId() else None
+    called = None if call is None else _named(call.name)
+    if call is not None and called is not None:
+        return _with_arguments(called, call)
     given = {str(given.GetBaseName()) for given in shader.GetInputs()}
-    if name.startswith("OmniPBR") or given & _OMNI_PBR:
+    if (read := _named(name)) is not None:
+        return read
+    if given & _OMNI_PBR:
         return _omni_pbr
-    if name.startswith("OmniSurface") or given & _OMNI_SURFACE:
+    if given & _OMNI_SURFACE:
         return _omni_surface
     if name in _FLAT:
         return _flat
     return _by_names if given & {row[0] for row in _BASES} else None
+
+
+def _with_arguments(read: Callable[[Inputs], Terms | None], call: Call) -> Callable[[Inputs], Terms | None]:
+    return lambda inputs: read(_Called(inputs, call))
+
+
+def _named(name: str) -> Callable[[Inputs], Terms | None] | None:
+    """What reads the MDL materials of a name, if that is known."""
+    known = {"OmniPBR": _omni_pbr, "OmniSurface": _omni_surface}
+    return next((read for start, read in known.items() if name.startswith(start)), None)
 
 
 _OMNI_PBR = {"diffuse_color_constant", "diffuse_texture", "diffuse_tint", "reflection_roughness_constant"}

@@ -110,8 +110,17 @@ class Images:
         if inherited:
             space = inherited
             image = self.read(asset, space)
-        pixels = _converted(_channels(image, channels), space)
-        return image, pixels, (asset.resolvedPath or asset.path, space), (1, 1)
+        pixels, key = self.pixels(asset, space, channels)
+        return image, pixels, key, (1, 1)
+
+    def pixels(self, asset: Sdf.AssetPath, space: str, channels: list[int]) -> tuple[Floats, Hashable]:
+        """Some channels of an image, [h, w, c], and a key.
+
+        Raises:
+            Unreadable: There is none.
+        """
+        found = _converted(_channels(self.read(asset, space), channels), space)
+        return found, (asset.resolvedPath or asset.path, space)
 
     def _udim(
         self,

@@ -101,6 +101,16 @@ class Network:
             self.warn(f"{shader_input.GetBaseName()}: {trouble}; it is left out")
             return None
 
+    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+        """An image, repeated, as `picture` has it; None where it cannot be read."""
+        try:
+            pixels, key = self._images.pixels(asset, space, channels)
+            place = _placed(uv, transform, (Wrap.REPEAT, Wrap.REPEAT), (1, 1))
+        except Unreadable as trouble:
+            self.warn(f"{trouble}; it is left out")
+            return None
+        return Signal(pixels, np.zeros(len(channels)), place, (key, tuple(channels)), asset.path)
+
     def _file(
         self,
         attribute: Usd.Attribute | None,

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pxr import Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
 from warp_ir.usd import value
@@ -127,6 +127,10 @@ class _Inputs:
             color: Whether it may be decoded.
         """
         return self.network.picture(self._shader.GetInput(name), channels, uv, transform, color=color)
+
+    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+        """An image, repeated; None where it cannot be read."""
+        return self.network.file(asset, channels, space, uv, transform)
 
     def normal(self, name: str, *, tangent: bool) -> Signal | None:
         """A normal map, in tangent space; None where there is none, or a flat one.
