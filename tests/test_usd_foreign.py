@@ -171,6 +171,14 @@ def test_an_empty_array_is_no_value(tmp_path):
     assert warned(scene, "/A", "opacity", "not a finite number")
 
 
+def test_a_base_colour_that_is_not_understood_is_grey(tmp_path):
+    """As a surface of which nothing is known, and not black, which would take light away."""
+    text = material_text("color3f inputs:baseColor.connect = </A/N.outputs:out>", shader="mine").rstrip()[:-1]
+    node = 'def Shader "N" {\n uniform token info:id = "clouds"\n color3f outputs:out\n}\n}\n'
+    scene = load(tmp_path, text + node + mesh())
+    assert only_material(scene).albedo == (0.18,) * 3 and warned(scene, "/A", "clouds is not understood")
+
+
 def test_what_is_understood_exactly_comes_first(tmp_path):
     """A UsdPreviewSurface for all renderers is taken, and nothing said of the MDL beside it."""
     text = mdl("color3f inputs:diffuse_color_constant = (1, 0, 0)").rstrip()[:-1]

@@ -19,6 +19,7 @@ from warp_ir.usd.mdl import Call, read_call
 from warp_ir.usd.signal import Signal, as_color, combine, constant
 
 _BLACK: Color = (0.0, 0.0, 0.0)
+_GREY: Color = (0.18, 0.18, 0.18)
 _WHITE: Color = (1.0, 1.0, 1.0)
 
 
@@ -280,7 +281,7 @@ _GLOWS = (
 
 def _by_names(inputs: Inputs) -> Terms | None:
     """Whatever shader: the inputs that are commonly called so; None if it has no base colour."""
-    albedo = _first(inputs, _BASES)
+    albedo = _first(inputs, _BASES, _GREY)
     if albedo is None:
         return None
     if inputs.has("base_color_factor") and inputs.has("base_color_texture"):
@@ -290,15 +291,16 @@ def _by_names(inputs: Inputs) -> Terms | None:
     return Terms(
         albedo,
         inputs.grey(metallic, 0.0),
-        _first(inputs, _GLOWS) or constant(*_BLACK),
+        _first(inputs, _GLOWS, _BLACK) or constant(*_BLACK),
         inputs.grey(opacity, 1.0),
     )
 
 
-def _first(inputs: Inputs, rows: tuple[tuple[str, str, float], ...]) -> Signal | None:
+def _first(inputs: Inputs, rows: tuple[tuple[str, str, float], ...], unknown: Color) -> Signal | None:
+    """The first that there is, times its weight; `unknown` where what feeds it is not understood."""
     for color, weight, default in rows:
         if inputs.has(color):
-            found = inputs.color(color, _BLACK)
+            found = inputs.color(color, unknown)
             return combine("weight", np.multiply, found, inputs.grey(weight, default)) if weight else found
     return None
 
