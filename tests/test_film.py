@@ -71,6 +71,9 @@ def test_films_of_different_size_do_not_merge(device):
     other = Renderer(furnace(level=1), ir.RenderSettings(width=5, height=5), device=device)
     with pytest.raises(ir.InputError, match="cannot merge 5x5 into 12x8"):
         renderer.new_film().merge(other.new_film())
+    dark = Renderer(furnace(0.5, 0.0, level=1), SETTINGS, device=device)
+    with pytest.raises(ir.InputError, match="shows what emits"):
+        renderer.new_film().merge(dark.new_film())
 
 
 def test_values_that_are_not_finite_stay_out(device):

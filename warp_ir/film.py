@@ -184,10 +184,12 @@ class Film:
         """Adds another film of the same picture; that it used other iterations or another seed is up to you.
 
         Raises:
-            InputError: The films differ in size.
+            InputError: The films differ in size, or one shows what emits and the other does not.
         """
         if (self.width, self.height) != (other.width, other.height):
             raise InputError(f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels")
+        if self._data.emission.shape != other._data.emission.shape:
+            raise InputError("film: cannot merge a film that shows what emits with one that does not")
         if other.iterations == 0:
             return
         n, m = self.iterations, other.iterations

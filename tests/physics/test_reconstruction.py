@@ -96,6 +96,22 @@ def test_two_films_filter_as_one(device):
     np.testing.assert_allclose(one.radiance(), whole.radiance(), rtol=1e-4, atol=1e-7)
 
 
+def test_a_picture_needs_no_renderer(device):
+    """The filter works in the renderer's memory while that is there, and else in its own: the same bits."""
+    settings = ir.RenderSettings(width=24, light_paths=64)
+    films = []
+    for _ in range(2):
+        renderer = ir.Renderer(cornell_box(), settings, device=device)
+        films.append(renderer.new_film())
+        for iteration in range(2):
+            renderer.add_iteration(films[-1], iteration)
+    first = films[0].radiance()  # whose renderer is gone
+    np.testing.assert_array_equal(first, films[1].radiance())
+    renderer.add_iteration(films[1], 2)  # a picture spoils nothing that the next iteration needs
+    renderer.add_iteration(films[0], 2)
+    np.testing.assert_array_equal(films[0].radiance(), films[1].radiance())
+
+
 def test_denoise_needs_its_extra(monkeypatch):
     """Without the denoiser, asking for it is an error before any work, which says what to install."""
     import sys
