@@ -256,17 +256,12 @@ def test_portals_cost_no_word(tmp_path):
 
 
 @pytest.mark.parametrize("prefix", ["inputs:", ""])
-def test_shaping_counts_where_the_schema_is_not_applied(tmp_path, prefix):
-    """Authored inputs of ShapingAPI shape the light without it, in old style too; what is not authored is no limit."""
-    more = f"float {prefix}shaping:cone:angle = 30\nfloat {prefix}shaping:cone:softness = 0.5"
+def test_shaping_needs_its_schema(tmp_path, prefix):
+    """Inputs of ShapingAPI without the schema are only attributes: the light shines to all sides, and that is said."""
+    more = f"float {prefix}shaping:cone:angle = 30\nfloat {prefix}shaping:focus = 2"
     scene = load(tmp_path, light_text("SphereLight", more))
-    shape = scene.lights[0].shaping
-    assert (shape.cone_angle, shape.cone_softness, shape.focus) == (30.0, 0.5, 0.0)
-    assert warned(scene, "/L", "ShapingAPI is not applied")
-    focused = load(tmp_path, light_text("SphereLight", f"float {prefix}shaping:focus = 2"))
-    assert focused.lights[0].shaping.cone_angle == 180.0 and focused.lights[0].shaping.focus == 2.0
-    idle = load(tmp_path, light_text("DiskLight", f"float {prefix}shaping:cone:angle = 180"))
-    assert idle.lights[0].shaping is None and not warned(idle, "ShapingAPI")
+    assert scene.lights[0].shaping is None
+    assert warned(scene, "/L", "shaping:cone:angle, shaping:focus: ignored, since ShapingAPI is not applied")
 
 
 def shaping(folder, kind, more):
@@ -522,14 +517,12 @@ def test_a_cross_of_another_shape_is_named(tmp_path):
 
 
 def test_shadows_can_be_switched_off(tmp_path):
-    """ShadowAPI's enable, also where it is authored without the schema, which is named."""
+    """ShadowAPI's enable; without the schema it does not count, and is named."""
     off = "bool inputs:shadow:enable = 0"
     scene = load(tmp_path, light_text("RectLight", off, SHADOWS))
     assert not scene.lights[0].shadows and not warned(scene, "/L")
     scene = load(tmp_path, light_text("RectLight", off))
-    assert not scene.lights[0].shadows and warned(scene, "/L", "ShadowAPI is not applied")
-    scene = load(tmp_path, light_text("RectLight", "bool inputs:shadow:enable = 1"))
-    assert scene.lights[0].shadows and not warned(scene, "/L")
+    assert scene.lights[0].shadows and warned(scene, "/L", "ShadowAPI is not applied")
 
 
 LINKED = """

@@ -44,6 +44,14 @@ class Inputs:
         attributes = (self.attribute(name) for name in names)
         return any(attribute and attribute.HasAuthoredValue() for attribute in attributes)
 
+    def applied(self, schema: type[Usd.APISchemaBase], *names: str) -> bool:
+        """Whether a schema is applied to the prim. Where it is not, its inputs `names` do not count, and are named."""
+        applied = bool(self.prim.HasAPI(schema))
+        idle = [] if applied else [name for name in names if self.authored(name)]
+        if idle:
+            self.warn(f"{', '.join(idle)}: ignored, since {schema.__name__} is not applied to the prim")
+        return applied
+
     def number(self, name: str, default: float) -> float:
         """A number input."""
         return value.number(self.attribute(name), self.time, default)

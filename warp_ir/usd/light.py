@@ -223,15 +223,12 @@ def projected_solid_angle(angle: float) -> float:
 
 
 def casts_shadows(inputs: Inputs) -> bool:
-    """What shadow:enable says, whether or not ShadowAPI is applied, as for shaping.
+    """What ShadowAPI says of it.
 
     Raises:
-        Unreadable: It has the wrong type.
+        Unreadable: shadow:enable has the wrong type.
     """
-    casts = inputs.flag("shadow:enable", True)
-    if not casts and not inputs.prim.HasAPI(UsdLux.ShadowAPI):
-        inputs.warn("shadow:enable is used although ShadowAPI is not applied")
-    return casts
+    return not inputs.applied(UsdLux.ShadowAPI, "shadow:enable") or inputs.flag("shadow:enable", True)
 
 
 def warn_of_unread(inputs: Inputs) -> None:
@@ -241,9 +238,10 @@ def warn_of_unread(inputs: Inputs) -> None:
         Unreadable: An input has the wrong type or is not finite.
     """
     prim = inputs.prim
-    color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
-    if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
-        inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
+    if prim.HasAPI(UsdLux.ShadowAPI):
+        color = value.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
+        if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
+            inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
     old = prim.GetRelationship("filters")
     if value.targets(UsdLux.LightAPI(prim).GetFiltersRel()) or (old and value.targets(old)):
         inputs.warn("light filters are not read")

@@ -12,22 +12,20 @@ _SHAPED = ("shaping:cone:angle", "shaping:cone:softness", "shaping:focus", "shap
 
 
 def read_shaping(inputs: Inputs, kind: LightKind) -> Shaping | None:
-    """A light's shaping; None where there is none, or it changes nothing.
+    """A light's shaping; None where the schema is not applied, or changes nothing.
 
-    Inputs that are authored count although the schema is not applied, as in Hydra: many files forget to apply it. A
-    dome has no shaping, as in OpenUSD's reference renderer: it shines from all sides.
+    A dome has none, as in OpenUSD's reference renderer: it shines from all sides.
 
     Raises:
         Unreadable: An input has the wrong type or is not finite.
     """
-    applied, authored = inputs.prim.HasAPI(UsdLux.ShapingAPI), inputs.authored(*_SHAPED)
-    if not (applied or authored):
+    if not inputs.applied(UsdLux.ShapingAPI, *_SHAPED):
         return None
     if kind == LightKind.DOME:
-        if authored:
+        if inputs.authored(*_SHAPED):
             inputs.warn("shaping does not apply to a dome and is ignored")
         return None
-    angle = min(max(inputs.number("shaping:cone:angle", 90.0 if applied else 180.0), 0.0), 180.0)
+    angle = min(max(inputs.number("shaping:cone:angle", 90.0), 0.0), 180.0)
     softness = min(max(inputs.number("shaping:cone:softness", 0.0), 0.0), 1.0)
     focus = max(inputs.number("shaping:focus", 0.0), 0.0)
     red, green, blue = value.color(inputs.attribute("shaping:focusTint"), inputs.time, (0.0, 0.0, 0.0))
@@ -48,6 +46,4 @@ def read_shaping(inputs: Inputs, kind: LightKind) -> Shaping | None:
         whole = 180.0
     if angle >= whole and softness == 0.0 and focus == 0.0 and profile is None:
         return None
-    if not applied:
-        inputs.warn("its shaping inputs are used although ShapingAPI is not applied")
     return Shaping(angle, softness, focus, tint, profile)
