@@ -14,6 +14,7 @@ from warp_ir.usd.glow import LAMP_UV, Lamp
 from warp_ir.usd.images import Images
 from warp_ir.usd.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.instancing import Level, combined, combined_colors
+from warp_ir.usd.linking import Linking
 from warp_ir.usd.material import ABSENT, Look, MaterialTable
 from warp_ir.usd.mesh import read_mesh, read_tet_mesh
 from warp_ir.usd.primvar import texture_coordinates
@@ -67,6 +68,7 @@ def build_meshes(
     images: Images | None = None,
     metals: str = "diffuse",
     purposes: Sequence[str] = PURPOSES[:2],
+    linking: Linking | None = None,
 ) -> Geometry:
     """All meshes, one per gprim with all its copies, those that are instanced, and the materials they use.
 
@@ -79,19 +81,30 @@ def build_meshes(
         images: Those that are known already, likewise.
         metals: "diffuse" or "black".
         purposes: Of the bindings of materials, in the order in which they are wanted.
+        linking: The links of lights, by which copies of a gprim may differ.
 
     Raises:
         InputError: There are more triangles than could be rendered.
     """
     table = MaterialTable(time, report, images, metals, purposes)
-    return _Builder(time, report, levels, table, {} if shapes is None else shapes).run(sites)
+    known = {} if shapes is None else shapes
+    return _Builder(time, report, levels, table, known, linking or Linking(())).run(sites)
 
 
 class _Builder:
     """From gprims to meshes and the materials they use."""
 
-    def __init__(self, time: Usd.TimeCode, report: Report, levels: int, table: MaterialTable, shapes: _Shapes) -> None:
+    def __init__(
+        self,
+        time: Usd.TimeCode,
+        report: Report,
+        levels: int,
+        table: MaterialTable,
+        shapes: _Shapes,
+        linking: Linking,
+    ) -> None:
         self._time, self._report, self._levels, self._table = time, report, levels, table
+        self._linking = linking
         self._skinning = Skinning(time, report)
         self._shapes = shapes
         self._seen: dict[tuple[object, ...], tuple[Shape, Look, bool]] = {}
@@ -226,10 +239,10 @@ class _Builder:
             return []
         return [slice(k, k + 1) for k in range(len(places))]
 
-    @staticmethod
-    def _signature(gprim: _Gprim) -> object:
-        """Equal for gprims of the same prototype that look the same; shapes and looks are kept, so ids will do."""
-        return id(gprim.shape), id(gprim.look), digest(gprim.site.local)
+    def _signature(self, gprim: _Gprim) -> object:
+        """Equal for gprims of one prototype that look and are lit alike; shapes and looks are kept: ids will do."""
+        links = self._linking.of(gprim.site.prim.GetPath())
+        return id(gprim.shape), id(gprim.look), digest(gprim.site.local), links
 
     def _prototype(self, group: Group, gprim: _Gprim) -> _Prototype:
         matrices = group.matrices()

@@ -1,6 +1,6 @@
 """Light links and shadow links: which meshes a light lights, and which cast its shadows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -12,6 +12,34 @@ from warp_ir.usd import value
 from warp_ir.usd.render_pass import includes
 from warp_ir.usd.report import Report
 
+
+class Linking:
+    """The links of a stage's lights that leave something out.
+
+    Args:
+        lights: The prims of all lights, gprims that are lights among them.
+    """
+
+    def __init__(self, lights: Iterable[Usd.Prim]) -> None:
+        self._queries: dict[_Rules, Any] = {}
+        for prim in lights:
+            api = UsdLux.LightAPI(prim)
+            for collection in (api.GetLightLinkCollectionAPI(), api.GetShadowLinkCollectionAPI()):
+                if _says(collection):
+                    query = collection.ComputeMembershipQuery()
+                    self._queries.setdefault(_rules(collection, query), query)
+
+    @property
+    def rules(self) -> frozenset[object]:
+        """Equal for the same links."""
+        return frozenset(self._queries)
+
+    def of(self, path: Sdf.Path) -> tuple[bool, ...]:
+        """Which of them hold a gprim; its copies can be stored once where that is the same for all."""
+        return tuple(includes(query, path) for query in self._queries.values())
+
+
+_Rules = tuple[frozenset[tuple[str, str]], str]
 _Links = tuple[frozenset[int], frozenset[int]]
 """Unlit and shadowless meshes."""
 
@@ -81,11 +109,15 @@ def _outside(collection: Usd.CollectionAPI, meshes: Sequence[Mesh], known: dict[
     if not _says(collection):
         return frozenset()
     query = collection.ComputeMembershipQuery()
-    rules = query.GetAsPathExpansionRuleMap()
-    if rules == _EVERYTHING:
+    if query.GetAsPathExpansionRuleMap() == _EVERYTHING:
         return frozenset()
-    written = frozenset((str(path), str(rule)) for path, rule in rules.items())
-    key = written, query.UsesPathExpansionRuleMap() or str(collection.ResolveCompleteMembershipExpression())
+    key = _rules(collection, query)
     if key not in known:
         known[key] = frozenset(k for k, mesh in enumerate(meshes) if not includes(query, Sdf.Path(mesh.name)))
     return known[key]
+
+
+def _rules(collection: Usd.CollectionAPI, query: Any) -> _Rules:
+    """Equal for collections of the same members."""
+    rules = frozenset((str(path), str(rule)) for path, rule in query.GetAsPathExpansionRuleMap().items())
+    return rules, "" if query.UsesPathExpansionRuleMap() else str(collection.ResolveCompleteMembershipExpression())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pxr import Tf, Usd
+from pxr import Tf, Usd, UsdLux
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.black import explain_blackness, explain_dark_lights
@@ -16,7 +16,7 @@ from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_sh
 from warp_ir.usd.gprim import Geometry, build_meshes
 from warp_ir.usd.images import Images
 from warp_ir.usd.light import LIGHTS, read_light
-from warp_ir.usd.linking import link
+from warp_ir.usd.linking import Linking, link
 from warp_ir.usd.motion import Motion
 from warp_ir.usd.render_pass import find_render_pass
 from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
@@ -251,7 +251,7 @@ class StageReader:
         report.include(still.report)
         if still.moving.shapes or still.moving.lights:
             moved = self._opened.part()
-            geometry = self._with_moving(still.geometry, still.moving.shapes, time, moved)
+            geometry = self._with_moving(still, time, moved)
             lights = lights + _lights(still.moving.lights, time, moved)
             moved.mention(self._moved)  # a shape that is known already does not tell again what it lacks
             report.include(moved)
@@ -297,32 +297,48 @@ class StageReader:
             for site in getattr(found, name):
                 moves = self._motion.moves(site.prim) or (site.lamp is not None and self._motion.moves(site.lamp))
                 getattr(moving if moves else staying, name).append(site)
-        if self._still is None or key != self._still.key:
+        lamps = [site.lamp or site.prim for site in (*found.lights, *found.shapes)]
+        linking = Linking(prim for prim in lamps if prim.HasAPI(UsdLux.LightAPI))
+        if self._still is None or key != self._still.key or linking.rules != self._still.linking.rules:
             read = self._opened.part()
             geometry = build_meshes(
-                staying.shapes, time, read, self._levels, images=self._images, metals=self._metals, purposes=key[-1]
+                staying.shapes,
+                time,
+                read,
+                self._levels,
+                images=self._images,
+                metals=self._metals,
+                purposes=key[-1],
+                linking=linking,
             )
             lights = _lights(staying.lights, time, read)
             self._shapes.clear()
         else:
             read, geometry, lights = self._still.read, self._still.geometry, self._still.lights
         report.include(read)
-        return _Still(key, moving, geometry, lights, tuple(staying.lights), read, report)
+        return _Still(key, moving, geometry, lights, tuple(staying.lights), linking, read, report)
 
-    def _with_moving(self, still: Geometry, sites: Sequence[Site], time: Usd.TimeCode, report: Report) -> Geometry:
+    def _with_moving(self, still: "_Still", time: Usd.TimeCode, report: Report) -> Geometry:
         """All geometry: what stays, what only changes its place, whose shape is read once, and what changes itself."""
+        sites = still.moving.shapes
         bends = [self._motion.reshapes(site.prim) for site in sites]
         rigid = [site for site, b in zip(sites, bends, strict=True) if not b]
         bending = [site for site, b in zip(sites, bends, strict=True) if b]
-        whole = still
+        whole = still.geometry
         for some, shapes in ((rigid, self._shapes), (bending, {})):
             if some:
-                whole = _join(
-                    whole,
-                    build_meshes(
-                        some, time, report, self._levels, shapes, self._images, self._metals, self._motion.purposes
-                    ),
+                more = build_meshes(
+                    some,
+                    time,
+                    report,
+                    self._levels,
+                    shapes,
+                    self._images,
+                    self._metals,
+                    self._motion.purposes,
+                    still.linking,
                 )
+                whole = _join(whole, more)
         return whole
 
 
@@ -338,6 +354,7 @@ class _Still:
     lights: tuple[Light, ...]
     lamps: tuple[Site, ...]
     """The lights that stay, those too that emit nothing."""
+    linking: Linking
     read: Report
     """Of the geometry and the lights that stay."""
     report: Report
