@@ -201,7 +201,9 @@ def write_image(path, pixels, kind="float"):
     import OpenImageIO as oiio
 
     pixels = np.asarray(pixels)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    spec["oiio:UnassociatedAlpha"] = 1  # colours are not multiplied by it
     out = oiio.ImageOutput.create(str(path))
-    assert out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)), oiio.geterror()
+    assert out.open(str(path), spec), oiio.geterror()
     assert out.write_image(np.ascontiguousarray(pixels))
     out.close()
