@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.level import at, load, mesh, placed, rotation, write_image
+from tests.physics.level import at, load, mesh, placed, rotation, usd, write_image
 
 pytestmark = pytest.mark.slow
 
@@ -273,3 +273,254 @@ def Xform "Instance" (instanceable = true
     }  # fmt: skip
     mean, error = reference(mi, scene, 3)
     agree(load(tmp_path, text), (mean / dim, error / dim), 3)
+
+
+def cube_usd(name, more="", inside=""):
+    return mesh(name, CUBE, SIDES, f"{more}\n{inside}")
+
+
+def cube_mi(mi, matrix, color):
+    return polygon(mi, moved(matrix, CUBE), SIDES, diffuse(rgb(*color)))
+
+
+def test_a_sky_through_screens(mi, tmp_path):
+    """A turned lat-long sky with a small sun; a screen with holes, one that is half there, a cube; two bounces."""
+    rows, columns = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(128) + 0.5) / 128, indexing="ij")
+    sky = np.stack([0.6 + 0.4 * np.sin(2 * np.pi * columns), 0.7 - 0.3 * rows, 0.5 + 0.5 * np.cos(np.pi * rows)], -1)
+    sky[12:15, 80:84] += (60.0, 50.0, 40.0)
+    write_image(tmp_path / "sky.exr", sky.astype(np.float32))
+    holes = np.kron(np.indices((4, 4)).sum(0) % 2, np.ones((16, 16)))[..., None] * 255
+    write_image(tmp_path / "holes.png", np.concatenate([holes] * 3, -1).astype(np.uint8), "uint8")
+    turn = rotation(1, 130.0) @ rotation(0, 20.0)
+    screen = [(-1.6, 1.8, -1.2), (-0.2, 1.8, -1.2), (-0.2, 1.6, 1.0), (-1.6, 1.6, 1.0)]
+    veil = [(0.3, 0.0, -0.6), (1.5, 0.0, -0.9), (1.5, 1.4, -0.9), (0.3, 1.4, -0.6)]
+    block = placed(rotation(1, 25.0) @ np.diag([0.6, 0.8, 0.6]), (-0.6, 0.4, 0.4))
+    st = 'texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")'
+    api = '"MaterialBindingAPI"'
+    text = room_usd() + CAMERA % "" + f"""
+def DomeLight "Sky" {{
+    {at(placed(turn))}
+    float inputs:intensity = 2
+    float inputs:exposure = -1
+    asset inputs:texture:file = @sky.exr@
+    token inputs:texture:format = "latlong"
+}}
+""" + cube_usd("Block", at(block), "color3f[] primvars:displayColor = [(0.3, 0.8, 0.4)]")  # fmt: skip
+    text += mesh("Screen", screen, more=f"{st}\n rel material:binding = </Holes>", api=api)
+    text += mesh("Veil", veil, more="rel material:binding = </Half>", api=api)
+    clamp = 'token inputs:wrapS = "clamp"\n token inputs:wrapT = "clamp"\n token inputs:sourceColorSpace = "raw"'
+    holed = """float inputs:opacityThreshold = 0.5
+        color3f inputs:diffuseColor = (0.6, 0.2, 0.2)
+        float inputs:opacity.connect = </Holes/T.outputs:r>"""
+    text += material("Holes", holed, image_nodes("Holes", "holes.png", clamp, "r"))
+    text += material("Half", "color3f inputs:diffuseColor = (0.2, 0.3, 0.9)\n float inputs:opacity = 0.5")
+
+    image = {"type": "bitmap", "filename": str(tmp_path / "holes.png"), "raw": True, "wrap_mode": "clamp",
+             "filter_type": "nearest"}  # fmt: skip
+    uvs = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    quad = [(0, 1, 2, 3)]
+    scene = {
+        **room_mi(mi),
+        "sensor": sensor(mi),
+        "sky": {
+            "type": "envmap",
+            "filename": str(tmp_path / "sky.exr"),
+            "to_world": mi.ScalarTransform4f(placed(turn)),
+        },
+        "block": cube_mi(mi, block, (0.3, 0.8, 0.4)),
+        "screen": polygon(
+            mi, screen, quad, {"type": "mask", "opacity": image, "nested": diffuse(rgb(0.6, 0.2, 0.2))}, uvs
+        ),
+        "veil": polygon(mi, veil, quad, {"type": "mask", "opacity": 0.5, "nested": diffuse(rgb(0.2, 0.3, 0.9))}),
+    }
+    agree(load(tmp_path, text, warnings=["opacity"]), reference(mi, scene, 2), 2, iterations=512)
+
+
+def test_materials(mi, tmp_path):
+    """Images that repeat, are mirrored and turned, UDIM, colours of points, metal and speculars; three bounces."""
+    random = np.random.default_rng(5)
+    pixels = random.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    write_image(tmp_path / "t.png", pixels, "uint8")
+    for number in (1001, 1002):
+        write_image(tmp_path / f"u.{number}.png", random.integers(0, 256, (8, 8, 3), dtype=np.uint8), "uint8")
+    api = '"MaterialBindingAPI"'
+    lamp = placed(rotation(0, -90.0), (0.2, 2.7, 0.0))
+    points = {name: room[0] for name, room in ROOM.items()}
+    st = [(0, 0), (2.5, 0), (2.5, 2), (0, 2)]
+    wide = [(0, 0), (2, 0), (2, 1), (0, 1)]
+    text = CAMERA % "" + f"""
+def RectLight "Lamp" {{
+    {at(lamp)}
+    float inputs:intensity = 8
+    float inputs:width = 1.2
+    float inputs:height = 0.7
+}}
+"""  # fmt: skip
+
+    def wall(name, uvs, look):
+        coordinates = f'texCoord2f[] primvars:st = {uvs} (interpolation = "vertex")'
+        return mesh(name, points[name], more=f"{coordinates}\n rel material:binding = </{look}>", api=api)
+
+    text += wall("Floor", st, "Turned") + wall("Back", st, "Mirror") + wall("Side", wide, "Tiles")
+    turned = """def Shader "P" {
+        uniform token info:id = "UsdTransform2d"
+        float2 inputs:in.connect = </Turned/R.outputs:result>
+        float2 inputs:scale = (0.75, 1.5)
+        float inputs:rotation = 20
+        float2 inputs:translation = (0.3, 0.1)
+        float2 outputs:result
+    }"""
+    repeat, mirror = (f'token inputs:wrapS = "{w}"\n token inputs:wrapT = "{w}"' for w in ("repeat", "mirror"))
+    for name, file, more in (("Turned", "t.png", repeat), ("Mirror", "t.png", mirror), ("Tiles", "u.<UDIM>.png", "")):
+        if name == "Mirror":
+            more += "\n float4 inputs:scale = (0.5, 0.9, 0.7, 1)\n float4 inputs:bias = (0.1, 0, 0.2, 0)"
+        nodes = image_nodes(name, file, more)
+        if name == "Turned":
+            nodes = nodes.replace("</Turned/R.", "</Turned/P.") + "\n    " + turned
+        text += material(name, f"color3f inputs:diffuseColor.connect = </{name}/T.outputs:rgb>", nodes)
+    colors = random.random((8, 3)).round(3)
+    metal = placed(rotation(1, 30.0) @ np.diag([0.7, 1.1, 0.7]), (-0.6, 0.55, -0.4))
+    plastic = placed(np.diag([0.5, 0.5, 0.5]), (0.6, 0.25, 0.9))
+    painted = placed(rotation(1, -20.0) @ np.diag([0.6, 0.7, 0.6]), (1.3, 0.35, -0.3))
+    # Triangles, so that nobody has to choose a diagonal.
+    triangles = [t for a, b, c, d in SIDES for t in ((a, b, c), (a, c, d))]
+    for name, matrix in (("Metal", metal), ("Plastic", plastic)):
+        text += mesh(name + "Box", CUBE, SIDES, f"{at(matrix)} rel material:binding = </{name}>", api)
+    painting = f'color3f[] primvars:displayColor = {usd(colors)} (interpolation = "vertex")'
+    text += mesh("Painted", CUBE, triangles, f"{at(painted)} {painting}")
+    text += material("Metal", "color3f inputs:diffuseColor = (0.9, 0.7, 0.3)\n float inputs:metallic = 1")
+    specular = "color3f inputs:diffuseColor = (0.2, 0.5, 0.6)\n int inputs:useSpecularWorkflow = 1\n"
+    text += material("Plastic", specular + "color3f inputs:specularColor = (0.2, 0.2, 0.2)")
+
+    def bitmap(file, wrap):
+        return {"type": "bitmap", "filename": str(tmp_path / file), "wrap_mode": wrap}
+
+    # The mirrored image with its scale and bias, decoded by the definition of sRGB.
+    x = pixels / 255.0
+    light = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    mixed = mi.Bitmap((light * (0.5, 0.9, 0.7) + (0.1, 0.0, 0.2)).astype(np.float32))
+    adjusted = {"type": "bitmap", "bitmap": mixed, "raw": True, "wrap_mode": "mirror"}
+    spun = (np.array(st) * (0.75, 1.5)) @ rotation(2, 20.0)[:2, :2].T + (0.3, 0.1)
+    quad = [(0, 1, 2, 3)]
+    left, right = np.array(points["Side"], float), np.array(points["Side"], float)
+    left[[1, 2]] = right[[0, 3]] = 0.5 * (left[[0, 3]] + left[[1, 2]])
+    unit = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    flip = lamp @ np.diag([-0.6, 0.35, -1.0, 1.0])
+    scene = {
+        "sensor": sensor(mi),
+        "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(flip), "bsdf": {"type": "null"},
+                 "emitter": {"type": "area", "radiance": rgb(8)}},
+        "floor": polygon(mi, points["Floor"], quad, diffuse(bitmap("t.png", "repeat")), spun),
+        "back": polygon(mi, points["Back"], quad, diffuse(adjusted), st),
+        "left": polygon(mi, left, quad, diffuse(bitmap("u.1001.png", "clamp")), unit),
+        "right": polygon(mi, right, quad, diffuse(bitmap("u.1002.png", "clamp")), unit),
+        "metal": cube_mi(mi, metal, (0.9, 0.7, 0.3)),
+        "plastic": cube_mi(mi, plastic, 0.8 * np.array([0.2, 0.5, 0.6]) + 0.2),
+        "painted": polygon(mi, moved(painted, CUBE), triangles,
+                           diffuse({"type": "mesh_attribute", "name": "vertex_color"}), colors=colors),
+    }  # fmt: skip
+    agree(load(tmp_path, text, warnings=["metal", "specular"]), reference(mi, scene, 3), 3)
+
+
+def copies(name, target, matrices):
+    return "".join(
+        f'def Xform "{name}{k}" (instanceable = true\n prepend references = <{target}>) {{\n {at(m)} }}\n'
+        for k, m in enumerate(matrices)
+    )
+
+
+def test_instances(mi, tmp_path, monkeypatch):
+    """Nested native instances and a turned, scaled point instancer, written out or stored once; three bounces."""
+    inner = [
+        placed(rotation(1, 20.0) @ np.diag([0.4, 0.6, 0.4]), (0.0, 0.3, 0.0)),
+        placed(np.diag([0.2] * 3), (0.5, 0.1, 0.3)),
+    ]
+    outer = [
+        placed(rotation(1, 75.0), (-0.9, 0.0, 0.2)),
+        placed(rotation(1, -30.0) @ np.diag([1.3, 0.8, -1.0]), (0.8, 0.0, -0.9)),
+    ]
+    angle, scales = math.radians(50.0), [(0.3, 0.3, 0.5), (0.5, 0.2, 0.2)]
+    places = [(0.3, 0.4, 1.1), (-0.2, 1.4, -0.8)]
+    turns = [rotation(0, 50.0), rotation(2, 50.0)]
+    own = placed(rotation(1, 10.0), (0.1, 0.0, 0.0))
+    cloud = placed(rotation(1, 5.0), (0.2, 0.0, 0.1))
+    w, s = math.cos(angle / 2), math.sin(angle / 2)
+    lamp = placed(rotation(0, -90.0), (0.0, 2.8, 0.2))
+    color = "color3f[] primvars:displayColor = [%s]"
+    text = room_usd() + CAMERA % "" + f"""
+def RectLight "Lamp" {{
+    {at(lamp)}
+    float inputs:intensity = 12
+}}
+over "Pair" {{
+    {copies("C", "/Cube", inner)}
+}}
+over "Cube" {{
+    {cube_usd("Box", color % "(0.8, 0.7, 0.2)")}
+}}
+{copies("P", "/Pair", outer)}
+def PointInstancer "Cloud" {{
+    rel prototypes = </Cloud/Brick>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = {places}
+    quatf[] orientationsf = [({w}, {s}, 0, 0), ({w}, 0, 0, {s})]
+    float3[] scales = {scales}
+    {at(cloud)}
+    {cube_usd("Brick", at(own), color % "(0.2, 0.4, 0.9)")}
+}}
+"""  # fmt: skip
+    matrices = [a @ b for a in outer for b in inner]
+    bricks = [
+        cloud @ placed(turn @ np.diag(scale), place) @ own
+        for turn, scale, place in zip(turns, scales, places, strict=True)
+    ]
+    scene = {
+        **room_mi(mi),
+        "sensor": sensor(mi),
+        "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(lamp @ np.diag([-0.5, 0.5, -1.0, 1.0])),
+                 "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": rgb(12)}},
+        **{f"cube{k}": cube_mi(mi, m, (0.8, 0.7, 0.2)) for k, m in enumerate(matrices)},
+        **{f"brick{k}": cube_mi(mi, m, (0.2, 0.4, 0.9)) for k, m in enumerate(bricks)},
+    }  # fmt: skip
+    expected = reference(mi, scene, 3)
+    agree(load(tmp_path, text), expected, 3)
+    monkeypatch.setattr("warp_ir.usd.sharing.MOST_WRITTEN", 0)
+    stored = load(tmp_path, text)
+    assert stored.instances
+    agree(stored, expected, 3)
+
+
+@pytest.mark.parametrize("how", ["lens", "offset", "orthographic"])
+def test_cameras(mi, tmp_path, how):
+    """A thin lens with its focus on the cube, a shifted aperture, and parallel rays; two bounces."""
+    lamp = placed(rotation(0, -90.0), (0.3, 2.7, 0.4))
+    block = placed(rotation(1, 25.0) @ np.diag([0.6, 0.8, 0.6]), (-0.3, 0.4, 0.4))
+    more = {
+        "lens": "float fStop = 16\n    float focusDistance = 3.8",
+        "offset": "float horizontalApertureOffset = 6\n    float verticalApertureOffset = -4",
+        "orthographic": 'uniform token projection = "orthographic"',
+    }[how]
+    text = room_usd() + CAMERA % more + f"""
+def RectLight "Lamp" {{
+    {at(lamp)}
+    float inputs:intensity = 9
+}}
+""" + cube_usd("Block", at(block), "color3f[] primvars:displayColor = [(0.3, 0.8, 0.4)]")  # fmt: skip
+    seen = sensor(mi)
+    if how == "lens":
+        # The focal length is 50 tenths of a unit.
+        seen |= {"type": "thinlens", "aperture_radius": 0.5 * 5.0 / 16.0, "focus_distance": 3.8}
+    elif how == "offset":
+        seen |= {"principal_point_offset_x": 6 / 40, "principal_point_offset_y": 4 / (40 * HEIGHT / WIDTH)}
+    else:
+        look = mi.ScalarTransform4f().look_at(origin=EYE.tolist(), target=TARGET.tolist(), up=[0, 1, 0])
+        seen = {k: v for k, v in seen.items() if not k.startswith("fov")}
+        seen |= {"type": "orthographic", "to_world": look @ mi.ScalarTransform4f().scale([2.0, 2.0, 1.0])}
+    scene = {
+        **room_mi(mi),
+        "sensor": seen,
+        "block": cube_mi(mi, block, (0.3, 0.8, 0.4)),
+        "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(lamp @ np.diag([-0.5, 0.5, -1.0, 1.0])),
+                 "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": rgb(9)}},
+    }  # fmt: skip
+    agree(load(tmp_path, text), reference(mi, scene, 2), 2)
