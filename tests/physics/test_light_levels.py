@@ -239,14 +239,14 @@ def quaternion(matrix):
 
 
 @pytest.mark.parametrize("how", ["native", "nested", "points", "points in native"])
-@pytest.mark.parametrize("kind", ["RectLight", "mesh", "shaped mesh", "glow"])
+@pytest.mark.parametrize("kind", ["RectLight", "DistantLight", "mesh", "shaped mesh", "glow"])
 def test_lights_in_instances(tmp_path, kind, how):
     """E of all places, each with its own matrix; normalized, the radiance is over each one's area in the world."""
     normalize = kind != "glow"
     own = placed(rotation(0, 15.0), (0.1, 0.0, 0.05))
     more = f"float inputs:intensity = 3\n    bool inputs:normalize = {str(normalize).lower()}"
-    if kind == "RectLight":
-        lamp = light("RectLight", more, own)
+    if kind in ("RectLight", "DistantLight"):
+        lamp = light(kind, more, own)
     elif kind == "mesh":
         lamp = panel(more, own)
     elif kind == "shaped mesh":
@@ -299,6 +299,10 @@ def PointInstancer "Cloud" {{
         a = world[:3, :3]
         radiance = 3.0 / (np.linalg.norm(np.cross(a[:, 0], a[:, 1])) if normalize else 1.0)
         axis = -a[:, 2] / np.linalg.norm(a[:, 2])
+
+        if kind == "DistantLight":  # normalized: in lux
+            expected = expected + 3.0 * max(-axis[1], 0.0)
+            continue
 
         def emitted(u, v, d, radiance=radiance, axis=axis):
             return radiance * (shaped(d @ axis, **SHAPINGS["soft"]) if kind == "shaped mesh" else 1.0)

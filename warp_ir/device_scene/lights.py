@@ -104,7 +104,12 @@ def _light_axes(light: Light) -> npt.NDArray[np.float64]:
         return linear * light.radius
     if light.kind == LightKind.CYLINDER:
         return linear * np.array([light.length, light.radius, light.radius])
-    rotation = np.linalg.qr(linear)[0] if np.linalg.det(linear) != 0.0 else np.eye(3)
+    if np.linalg.det(linear) == 0.0:
+        return np.eye(3)
+    # The first of the axes keeps its direction, whatever scale and shear do to the others: for a sun where it shines.
+    order = [2, 0, 1] if light.kind == LightKind.DISTANT else [0, 1, 2]
+    rotation = np.empty((3, 3))
+    rotation[:, order] = np.linalg.qr(linear[:, order])[0]
     return rotation * np.where(np.sum(rotation * linear, axis=0) < 0.0, -1.0, 1.0)
 
 
