@@ -42,7 +42,7 @@ from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
 from warp_ir.reconstruction import SCRATCH, Reconstruction
-from warp_ir.sampling import iteration_scramble
+from warp_ir.sampling import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl import Vpls, emit_vpls, to_host
@@ -155,9 +155,7 @@ class Renderer:
 
     def add_iteration(self, film: Film, iteration: int) -> None:
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
-        # Bit-reversed, so that any 2^k iterations that follow each other are spread over the shutter's time.
-        bits = len(self._moments).bit_length() - 1
-        moment = self._moments[int(f"{iteration % (1 << bits):0{bits}b}"[::-1], 2) if bits else 0]
+        moment = self._moments[stratum(iteration, len(self._moments).bit_length() - 1)]
         moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
         with self.launcher.phase("film"), self.launcher.undisturbed():  # no part of an iteration without the rest
             film.add(self._gbuffer, self._direct, self._indirect, moment.exposure)

@@ -6,6 +6,8 @@ Every prefix of 2^k points is stratified in each dimension, exactly; two scrambl
 estimates. There is no state: the same arguments give the same number on any thread of any machine.
 """
 
+from functools import cache
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -33,6 +35,7 @@ _JOE_KUO = (
 SOBOL_DIMENSIONS = len(_JOE_KUO) + 1
 """Dimensions that are one Sobol' sequence; beyond them, the sequence is shuffled and used again."""
 
+_TIME = wp.constant(4)  # after the place in the pixel and that on the lens
 _DIMENSIONS = wp.constant(SOBOL_DIMENSIONS)
 _GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
 _HASH_1 = wp.constant(wp.uint32(0x7FEB352D))
@@ -70,6 +73,23 @@ def iteration_scramble(seed: int, iteration: int) -> int:
     return int(words[0])
 
 
+@cache
+def _time_columns() -> tuple[int, ...]:
+    return tuple(int(x) for x in sobol_matrices().reshape(-1, 32)[_TIME])
+
+
+def stratum(iteration: int, bits: int) -> int:
+    """Which of 2^bits parts of the time an iteration is for: 2^bits that begin at a multiple of that take all in turn.
+
+    It has a dimension of its own beside those of the camera: what is sampled together must not go hand in hand.
+    """
+    x = 0
+    for k, column in enumerate(_time_columns()):
+        if iteration >> k & 1:
+            x ^= column
+    return sum((x >> k & 1) << (bits - 1 - k) for k in range(bits))
+
+
 @wp.func
 def hash_combine(a: wp.uint32, b: wp.uint32) -> wp.uint32:
     """A new 32-bit scramble from two (the finalizer of Wellons' lowbias32)."""
@@ -86,6 +106,22 @@ def _reverse_bits(x: wp.uint32) -> wp.uint32:
     y = ((y >> wp.uint32(4)) & _MASK_4) | ((y & _MASK_4) << wp.uint32(4))
     y = ((y >> wp.uint32(8)) & _MASK_8) | ((y & _MASK_8) << wp.uint32(8))
     return (y >> wp.uint32(16)) | (y << wp.uint32(16))
+
+
+@wp.func
+def stratum_at(matrices: wp.array[wp.uint32], iteration: int, bits: int) -> int:
+    """The same as `stratum`."""
+    i = wp.uint32(iteration)
+    x = wp.uint32(0)
+    column = 32 * _TIME
+    while i != wp.uint32(0):
+        if (i & wp.uint32(1)) != wp.uint32(0):
+            x = x ^ matrices[column]
+        i = i >> wp.uint32(1)
+        column += 1
+    if bits == 0:
+        return 0
+    return int(_reverse_bits(x) >> wp.uint32(32 - bits))
 
 
 @wp.func
