@@ -180,20 +180,6 @@ def test_depth_of_field_can_be_declined():
     np.testing.assert_array_equal(*pictures)
 
 
-def test_the_filter_leaves_what_is_blurred_to_the_mean():
-    """A picture through a lens has the same mean with and without the filter; blurred pixels, the same bits."""
-    scene = ir.load_usd("scenes_usd/cornell_box.usda")
-    scene = replace(scene, camera=replace(scene.camera, lens_radius=0.06, focus_distance=2.6))
-    settings = ir.RenderSettings(width=48, height=48, iterations=16, light_paths=256)
-    filtered, plain = ir.render(scene, settings), ir.render(scene, replace(settings, filter=False))
-    same = (filtered.radiance() == plain.radiance()).all(axis=2)
-    assert 0.02 < same.mean() < 0.98
-    error = np.sqrt((plain.standard_error() ** 2).sum(axis=(0, 1))) / 48**2
-    difference = (filtered.radiance() - plain.radiance()).mean(axis=(0, 1))
-    # Pixels share their VPLs: their noise is correlated, up to all of it.
-    assert (np.abs(difference) < 4 * np.maximum(error, 0.001 * plain.radiance().mean(axis=(0, 1)))).all()
-
-
 @pytest.mark.parametrize("wrong", [{"lens_radius": -1.0}, {"lens_radius": 1.0, "focus_distance": 0.0}])
 def test_an_impossible_lens_is_an_error(wrong):
     """A negative radius, or a focus in the camera."""

@@ -124,7 +124,16 @@ def mapped():
     return ir.Scene(furnace(level=1).meshes, (ir.Material("m", normal_texture=normals),))
 
 
-@pytest.mark.parametrize("scene", [cornell_box(), lamps(), mapped()], ids=["glows", "lamps", "mapped"])
+def through_a_lens():
+    scene = lamps()
+    return replace(scene, camera=replace(scene.camera, lens_radius=0.1, focus_distance=1.0))
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [cornell_box(), lamps(), mapped(), through_a_lens(), moving()],
+    ids=["glows", "lamps", "mapped", "lens", "moving"],
+)
 @pytest.mark.parametrize("settings", [{}, {"filter": False}, {"estimator": "path"}, {"visible_lights": True}], ids=str)
 def test_what_a_pixel_takes(scene, settings, monkeypatch):
     """By as many bytes a pixel all arrays grow with the picture, once two iterations and a picture have been made."""

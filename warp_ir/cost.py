@@ -31,6 +31,7 @@ _ITERATION = 68  # what the camera sees, and the light there
 _OBSERVED = 92  # by the filter, beside the film
 _LAYERS = 72  # where an iteration lay: two images and their noise
 _FILTERED = 24
+_SORTED = 18  # samples by pixels
 _DENOISER = 100  # about; what it takes for itself is not in it
 
 
@@ -43,6 +44,10 @@ def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
     if settings.filters:
         iteration = max(iteration, _LAYERS)
         total += _OBSERVED + _FILTERED
+        moments = scene.shutter if settings.motion_blur else ()
+        lens = settings.depth_of_field and scene.camera.lens_radius > 0.0
+        surfaces = {tuple(id(x) for x in (*m.meshes, *m.instances)) for m in moments}
+        total += _SORTED * (lens or len(moments) > 1) + _COLOR * (len(surfaces) > 1)
     return total + iteration + _DENOISER * settings.denoise
 
 

@@ -169,15 +169,15 @@ class Film:
             setattr(data, name, launcher.zeros(pixels, wp.int32))
         self._data = data
 
-    def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0) -> None:
-        """Adds one iteration: what the camera saw, and the irradiance over π estimated for it."""
+    def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0, moment: int = 0) -> None:
+        """Adds one iteration: what the camera saw at some moment, and the irradiance over π estimated for it."""
         self._launcher.launch(
             _add,
             self.width * self.height,
             [gbuffer, direct, indirect, exposure, self.iterations, self._data],
         )
         if self.reconstruction is not None:
-            self.reconstruction.observe(gbuffer, direct, indirect)
+            self.reconstruction.observe(gbuffer, direct, indirect, moment)
         self.iterations += 1
 
     def merge(self, other: "Film") -> None:

@@ -13,12 +13,21 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher, carve, floats
 from warp_ir.lights import lights_found, surface_seen
-from warp_ir.surface import albedo, closest, mapped_normal, shading_normal, smooth_rise
+from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, smooth_rise
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _FARTHEST = wp.constant(1.0e30)  # a plane that a ray meets only there is parallel to it
 _JITTER = wp.constant(wp.uint32(0x6A09E667))
+
+
+@wp.struct
+class Anchor:
+    """A point of a triangle, wherever that goes while the shutter is open."""
+
+    triangle: int
+    instance: int  # -1: in the world as it stands
+    weights: wp.uint32  # of the first and the second corner, in steps of 1/65535
 
 
 @wp.struct
@@ -33,6 +42,7 @@ class GBuffer:
     albedo: wp.array[wp.vec3]
     emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection; empty: there can be none
     depth: wp.array[wp.float32]  # along the camera's -Z
+    anchor: wp.array[Anchor]  # no rows if no surface moves while the shutter is open
 
 
 @wp.struct
@@ -66,6 +76,19 @@ def camera_ray(camera: CameraData, pixel: int, u: wp.vec2, lens: wp.vec2) -> Ray
 
 
 @wp.func
+def project(camera: CameraData, position: wp.vec3) -> wp.vec2:
+    """Where on the film, in pixels, the middle of the lens sees a point; far outside if it is not before the camera."""
+    apart = position - camera.origin
+    depth = wp.where(camera.orthographic == 1, 1.0, -wp.dot(apart, camera.back))
+    if depth <= 0.0:
+        return wp.vec2(-_FARTHEST, -_FARTHEST)
+    x = (wp.dot(apart, camera.right) / depth - camera.left) / camera.width
+    y = 1.0 - (wp.dot(apart, camera.up) / depth - camera.bottom) / camera.height
+    on_image = wp.vec2(x * float(camera.image_columns), y * float(camera.image_rows))
+    return on_image - wp.vec2(float(camera.first_column), float(camera.first_row))
+
+
+@wp.func
 def image_pixel(camera: CameraData, pixel: int) -> int:
     """Number of a pixel of the film in the whole image: what its random numbers depend on, wherever it is cut."""
     column = camera.first_column + pixel % camera.columns
@@ -84,6 +107,19 @@ class Sight:
     albedo: wp.vec3
     emission: wp.vec3
     depth: float
+    hit: Hit  # what the rest was made of
+
+
+@wp.func
+def anchor_of(hit: Hit) -> Anchor:
+    """Where a hit is on its triangle."""
+    out = Anchor()
+    out.triangle = hit.triangle
+    out.instance = hit.instance
+    u = wp.uint32(wp.clamp(hit.u, 0.0, 1.0) * 65535.0)
+    v = wp.uint32(wp.clamp(hit.v, 0.0, 1.0) * 65535.0)
+    out.weights = (u << wp.uint32(16)) | v
+    return out
 
 
 @wp.func
@@ -120,6 +156,7 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
     sight = Sight()
     sight.mesh = -1
     if hit.triangle >= 0:
+        sight.hit = hit
         sight.mesh = scene.triangle_mesh[hit.triangle]
         sight.position = hit.position
         sight.normal = hit.normal
@@ -153,6 +190,14 @@ def jitter(scene: SceneData, camera: CameraData, pixel: int, iteration: int, see
     return sampling.sample_2d(scene.sobol, iteration, 0, _jitter_scramble(camera, pixel, seed))
 
 
+@wp.func
+def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int, seed: wp.uint32) -> wp.vec2:
+    """Where on the lens, in the unit disk, an iteration's ray through a pixel starts."""
+    if camera.lens_radius <= 0.0:
+        return wp.vec2(0.0, 0.0)
+    return sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
+
+
 @wp.kernel
 def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
@@ -163,9 +208,7 @@ def _trace_primary(
     lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
         place = jitter(scene, camera, pixel, iteration, seed)
-        if camera.lens_radius > 0.0:
-            scramble = _jitter_scramble(camera, pixel, seed)
-            lens = sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, scramble))
+        lens = lens_point(scene, camera, pixel, iteration, seed)
     sight = see(scene, camera, camera_ray(camera, pixel, place, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
@@ -176,16 +219,19 @@ def _trace_primary(
     if gbuffer.emission.shape[0] > 0:
         gbuffer.emission[pixel] = sight.emission
     gbuffer.depth[pixel] = sight.depth
+    if gbuffer.anchor.shape[0] > 0:
+        gbuffer.anchor[pixel] = anchor_of(sight.hit)
 
 
 def new_gbuffer(
-    launcher: Launcher, pixels: int, *, mapped: bool, glows: bool, spare: int = 0
+    launcher: Launcher, pixels: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
 ) -> tuple[Any, Any, Any, Any]:
     """What an iteration fills in: a `GBuffer`, and two irradiances over π.
 
-    `mapped` says whether the scene has normal maps, `glows` whether the camera may see what emits. The first irradiance
-    takes the place of `normal`, which nothing needs afterwards. The last is the block of float32 that all of it lies
-    in, `spare` a pixel at least: scratch while no iteration is in work.
+    `mapped` says whether the scene has normal maps, `glows` whether the camera may see what emits, and `moving` whether
+    surfaces move while the shutter is open. The first irradiance takes the place of `normal`, which nothing needs
+    afterwards. The last is the block of float32 that all of it lies in, `spare` a pixel at least: scratch while no
+    iteration is in work.
     """
     vectors = ["position", "normal", "shading_normal", "albedo"]
     vectors += ["smooth_normal"] * mapped + ["emission"] * glows
@@ -196,6 +242,7 @@ def new_gbuffer(
     gbuffer.mesh, gbuffer.depth = mesh, depth
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)
+    gbuffer.anchor = launcher.empty(pixels if moving else 0, Anchor)
     if not glows:
         gbuffer.emission = launcher.empty(0, wp.vec3)
     if not mapped:

@@ -30,8 +30,10 @@ import warp_ir.estimators.vpl
 import warp_ir.film
 import warp_ir.gather
 import warp_ir.gbuffer
+import warp_ir.reconstruction.blur
 import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
+import warp_ir.reconstruction.moments
 import warp_ir.reconstruction.observations
 import warp_ir.vpl
 from warp_ir.cost import pixel_bytes
@@ -41,7 +43,7 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
 from warp_ir.launch import Cancelled, Launcher
-from warp_ir.reconstruction import SCRATCH, Reconstruction
+from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
@@ -116,11 +118,14 @@ class Renderer:
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
             estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
             self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
+        if camera.blurs and settings.filters:
+            launcher.load([warp_ir.reconstruction.blur, warp_ir.reconstruction.moments])
         pixels = camera.columns * camera.rows
         needs = {
             "pixels": pixels,
             "mapped": any(data.data.normal_map_count > 0 for data in uploaded),
             "glows": settings.visible_lights or any(moment.glows for moment in scenes),
+            "moving": settings.filters and surfaces_move(uploaded),
             "spare": SCRATCH if settings.filters else 0,
         }
         if self._needs != needs:
@@ -148,17 +153,17 @@ class Renderer:
         film = Film(*size, self.launcher, first.scene.frame, glows=self._needs["glows"])
         film.settings = self.settings
         if self.settings.filters:
-            film.reconstruction = Reconstruction(
-                first.scene, first.camera, self.launcher, self._gbuffer, self._block, first.exposure, self.settings.seed
-            )
+            seed = self.settings.seed
+            film.reconstruction = Reconstruction(self._moments, self.launcher, self._gbuffer, self._block, seed)
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
-        moment = self._moments[stratum(iteration, len(self._moments).bit_length() - 1)]
+        number = stratum(iteration, len(self._moments).bit_length() - 1)
+        moment = self._moments[number]
         moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
         with self.launcher.phase("film"), self.launcher.undisturbed():  # no part of an iteration without the rest
-            film.add(self._gbuffer, self._direct, self._indirect, moment.exposure)
+            film.add(self._gbuffer, self._direct, self._indirect, moment.exposure, number)
         wp.synchronize_device(self.launcher.device)
 
     def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:

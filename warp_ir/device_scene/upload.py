@@ -48,6 +48,10 @@ class DeviceScene:
     """Shared with other moments; and handed on to what is uploaded next."""
     changes: int
     """Of the surfaces, when this was uploaded."""
+    stored: Scene
+    """`source` as it is arranged in the tables ..."""
+    rows: list[int]
+    """... and the row of the first triangle of each of its meshes; -1: it has none."""
     bounds: tuple[float, ...]
     """Lower and upper corner of all moments together, in the world."""
 
@@ -126,7 +130,8 @@ def _upload(
         area = scene.area() * frame.scale**2
         data.footprint = math.sqrt(area / _PATCHES)
         owners = surfaces.fill(k, data)
-        upload_emitters(stored[k][0], surfaces.rows(k), gain, frame, data, launcher)
+        rows = surfaces.rows(k)
+        upload_emitters(stored[k][0], rows, gain, frame, data, launcher)
         data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
         itself = launcher.empty(1, SceneData)
         data.address = wp.uint64(itself.ptr)  # in the copy as well: what is called by address hands it on
@@ -144,6 +149,8 @@ def _upload(
                 source=scene,
                 surfaces=surfaces,
                 changes=surfaces.changes,
+                stored=stored[k][0],
+                rows=rows,
                 bounds=(*lower, *upper),
             )
         )

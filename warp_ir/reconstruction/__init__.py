@@ -5,14 +5,15 @@ averaged there (`observations.py`) and filtered (`filter.py`): no pixel mixes su
 What a pixel on an edge shows is then found by many cheap camera rays, each taking the irradiance of the neighbouring
 pixel whose surface it meets (`edges.py`).
 
-Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Then only the pixels that have
-met nothing but the surface in their centre are filtered; the others keep their plain mean.
+Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Samples are then kept for the
+pixel that shows their surface (`moments.py`), and pixels put together by camera rays as on edges (`blur.py`).
 
 Where that leaves the plain mean by more than the noise explains, the mean is believed: the bias vanishes with the
 noise. On edges a part of the difference is given back, as much of it as is not noise (James and Stein 1961)
 (`compose.py`).
 """
 
+from warp_ir.reconstruction.moments import surfaces_move
 from warp_ir.reconstruction.reconstruct import SCRATCH, Reconstruction
 
-__all__ = ["SCRATCH", "Reconstruction"]
+__all__ = ["SCRATCH", "Reconstruction", "surfaces_move"]

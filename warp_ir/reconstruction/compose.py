@@ -36,7 +36,7 @@ def _student(n: float) -> float:
 
 
 @wp.func
-def _give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
+def give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
     """What is to be believed of a difference between the plain mean and the result, by itself."""
     d = mean_channel(difference)
     ratio = _TRUST * _TRUST * _student(n) * variance / (d * d + 1.0e-30)
@@ -67,7 +67,7 @@ def _compose(
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     direct = raw_direct
     indirect = raw_indirect
-    if camera.blurs == 0 and (seen.count[p] != out.iterations or on_edge(surfaces, film, p)):
+    if seen.count[p] != out.iterations or on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
         other = Lit()
         other.weight = float(seen.other_count[p])
@@ -100,8 +100,8 @@ def _compose(
         indirect = wp.cw_mul(albedo, value(layer.indirect[p])) * exposure
         reflected = mean_channel(albedo) * exposure
         noise = seen.noise[p] * (reflected * reflected / n)
-        direct += _give_back(raw_direct - direct, noise[0], n)
-        indirect += _give_back(raw_indirect - indirect, noise[1], n)
+        direct += give_back(raw_direct - direct, noise[0], n)
+        indirect += give_back(raw_indirect - indirect, noise[1], n)
     if out.rows.shape[0] > 2:
         out.rows[2, p] = albedo
         out.rows[3, p] = normal
@@ -145,23 +145,22 @@ def edge_rays(iterations: int) -> int:
     return min(16 + 2 * iterations, _MOST_EDGE_RAYS)
 
 
-def compose(
-    scene: DeviceScene,
-    camera: Any,
-    seen: Any,
-    layers: tuple[Any, Any],
-    film: Any,
-    iterations: int,
-    exposure: float,
-    features: bool,
-    launcher: Launcher,
-) -> Any:
-    """The rows of a `Picture` of a filtered `Layer`, on the device; of `layers` the second one is used as scratch."""
-    pixels = camera.columns * camera.rows
+def new_picture(pixels: int, rest: Any, iterations: int, rays: int, features: bool, launcher: Launcher) -> Any:
+    """An uninitialised `Picture`; `rest` is a `Layer` to be overwritten, `rays` are those of a pixel on an edge."""
     out = Picture()
-    layer, out.rest = layers
+    out.rest = rest
     out.rows = launcher.empty((5 if features else 2, pixels), wp.vec3)
-    out.iterations, out.edge_rays = iterations, edge_rays(iterations)
-    launcher.launch(_compose, pixels, [scene.data, camera, seen, layer, film, exposure, out])
-    launcher.launch(_correct_edges, pixels, [seen.surfaces, out])
-    return out.rows
+    out.iterations, out.edge_rays = iterations, rays
+    return out
+
+
+def compose(
+    scene: DeviceScene, camera: Any, seen: Any, layer: Any, film: Any, exposure: float, out: Any, launcher: Launcher
+) -> None:
+    """Fills a `Picture` from a filtered `Layer`."""
+    launcher.launch(_compose, camera.columns * camera.rows, [scene.data, camera, seen, layer, film, exposure, out])
+
+
+def correct_edges(surfaces: Any, out: Any, launcher: Launcher) -> None:
+    """Gives back to a `Picture` what it lacks on edges."""
+    launcher.launch(_correct_edges, surfaces.columns * surfaces.rows, [surfaces, out])

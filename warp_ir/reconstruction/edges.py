@@ -39,7 +39,7 @@ class Lit:
 
 
 @wp.func
-def _add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: Lit) -> Lit:
+def add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: Lit) -> Lit:
     """Adds the irradiance of pixel `q`, if it shows the surface of a point seen `away` from its centre [pixels]."""
     out = lit
     direct = layer.direct[q]
@@ -55,7 +55,7 @@ def _add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point
 
 
 @wp.func
-def _interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> Lit:
+def interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> Lit:
     """Irradiance at a point seen through (u, v) of a pixel: from the four pixels around that show its surface.
 
     Or from any of the nine, if none of the four does.
@@ -74,7 +74,7 @@ def _interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.
                     inside = x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows
                     if inside and near == (ring == 0):
                         away = wp.vec2(u[0] - 0.5 - float(dx), u[1] - 0.5 - float(dy))
-                        lit = _add_neighbor(seen, layer, y * surfaces.columns + x, away, point, lit)
+                        lit = add_neighbor(seen, layer, y * surfaces.columns + x, away, point, lit)
     return lit
 
 
@@ -123,7 +123,7 @@ def look_closely(
         out.albedo += point.albedo
         out.normal += point.shading_normal
         if point.mesh >= 0 and wp.max(point.albedo) > 0.0:
-            lit = _interpolate(seen, layer, row, column, u, point)
+            lit = interpolate(seen, layer, row, column, u, point)
             if lit.weight == 0.0:
                 lit = other
             out.direct += wp.cw_mul(point.albedo, lit.direct) / lit.weight

@@ -54,6 +54,27 @@ def _find_edges(first: int, surfaces: Surfaces, out: wp.array[wp.int32]) -> None
             out[p] = 1
 
 
+@wp.func
+def add_sample(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
+    """Adds a sample to those on a pixel's surface, if it is finite."""
+    d = mean_channel(direct)
+    i = mean_channel(indirect)
+    if wp.isfinite(d) and wp.isfinite(i):
+        seen.direct[p] += direct
+        seen.indirect[p] += indirect
+        seen.squares[p] += wp.vec2(d * d, i * i)
+        seen.count[p] += 1
+
+
+@wp.func
+def add_other(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
+    """Adds a sample to those on surfaces that no pixel shows, if it is finite."""
+    if wp.isfinite(mean_channel(direct)) and wp.isfinite(mean_channel(indirect)):
+        seen.other_direct[p] += direct
+        seen.other_indirect[p] += indirect
+        seen.other_count[p] += 1
+
+
 @wp.kernel
 def _observe(
     first: int,
@@ -66,18 +87,10 @@ def _observe(
     p = first + wp.tid()
     surfaces = seen.surfaces
     if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
-        d = mean_channel(direct[p])
-        i = mean_channel(indirect[p])
-        if wp.isfinite(d) and wp.isfinite(i):
-            if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > MATCH:
-                seen.direct[p] += direct[p]
-                seen.indirect[p] += indirect[p]
-                seen.squares[p] += wp.vec2(d * d, i * i)
-                seen.count[p] += 1
-            elif not shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]):
-                seen.other_direct[p] += direct[p]
-                seen.other_indirect[p] += indirect[p]
-                seen.other_count[p] += 1
+        if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > MATCH:
+            add_sample(seen, p, direct[p], indirect[p])
+        elif not shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]):
+            add_other(seen, p, direct[p], indirect[p])
 
 
 @wp.kernel
@@ -143,16 +156,6 @@ def _spread(seen: Observations, q: int) -> wp.vec2:
     return wp.max(seen.squares[q] - wp.cw_mul(sums, sums) / float(seen.count[q]), wp.vec2(0.0))
 
 
-@wp.kernel
-def _leave_out(first: int, seen: Observations, iterations: int, layer: Layer) -> None:
-    """Makes a background of the pixels in which an iteration has seen more than the surface in their centre."""
-    p = first + wp.tid()
-    if seen.count[p] != iterations:
-        seen.surfaces.footprint[p] = 0.0
-        layer.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-        layer.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-
-
 _NO_SUMS = ("surfaces", "noise", "seed")
 
 
@@ -194,15 +197,6 @@ def average(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
     seen = _copy(Observations, seen)
     seen.noise = noise
     launcher.launch(_average, seen.count.shape[0], [seen.surfaces, seen, layer])
-    return seen
-
-
-def without_mixed(seen: Any, layer: Any, iterations: int, launcher: Launcher) -> Any:
-    """The same `Observations`, where pixels that have seen more than the surface in their centre show none."""
-    seen = _copy(Observations, seen)
-    seen.surfaces = _copy(Surfaces, seen.surfaces)
-    seen.surfaces.footprint = wp.clone(seen.surfaces.footprint)
-    launcher.launch(_leave_out, seen.count.shape[0], [seen, iterations, layer])
     return seen
 
 

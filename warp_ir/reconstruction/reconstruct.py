@@ -1,17 +1,19 @@
 """Reconstruction on one page: samples are observed iteration by iteration; a picture is made of them when asked for."""
 
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device_scene import DeviceScene
 from warp_ir.launch import Launcher, carve, floats
-from warp_ir.reconstruction.compose import compose, edge_rays
+from warp_ir.reconstruction.blur import blur_rays, compose_blurred
+from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_picture
 from warp_ir.reconstruction.filter import filter_layer, new_layer
-from warp_ir.reconstruction.observations import average, look, observe, sums, without_mixed
+from warp_ir.reconstruction.moments import Moment, guess_noise, new_blur, observe_blurred
+from warp_ir.reconstruction.observations import average, look, observe, sums
 
 _FILTER_PASSES = 6.0
 """Filtering takes as long as so many passes of camera rays: fewer where rays are dear."""
@@ -23,28 +25,30 @@ SCRATCH = floats(*_TYPES)
 class Reconstruction:
     """Gathers what the filter needs beside the film, and makes the picture of both."""
 
-    def __init__(
-        self,
-        scene: DeviceScene,
-        camera: Any,
-        launcher: Launcher,
-        gbuffer: Any,
-        block: Any,
-        exposure: float,
-        seed: int,
-    ) -> None:
-        """Looks through the centre of every pixel; `seed` is that of the film.
+    def __init__(self, moments: Sequence[Moment], launcher: Launcher, gbuffer: Any, block: Any, seed: int) -> None:
+        """Looks through the centre of every pixel.
 
-        `gbuffer` is scratch for that, and its `block`, as long as it is there, for every picture.
+        Args:
+            moments: While the shutter is open, a power of two; the one in the middle is looked at.
+            launcher: Where.
+            gbuffer: Scratch for that.
+            block: Its memory: as long as that is there, scratch for every picture.
+            seed: That of the film.
         """
-        self._block = weakref.ref(block)
-        self._scene, self._camera, self._launcher, self._exposure = scene, camera, launcher, exposure
+        middle = moments[len(moments) // 2]
+        self._scene, self._camera = middle.scene, middle.camera
+        self._exposure = sum(m.exposure for m in moments) / len(moments)
+        self._launcher, self._block = launcher, weakref.ref(block)
         with launcher.phase("filter"):
-            self._seen, self._on_edges = look(scene, camera, launcher, gbuffer, seed)
+            self._seen, self._on_edges = look(self._scene, self._camera, launcher, gbuffer, seed)
+            self._blur = new_blur(moments, launcher) if self._camera.blurs else None
 
-    def observe(self, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Adds one iteration's samples of irradiance over π."""
-        observe(self._seen, gbuffer, direct, indirect, self._launcher)
+    def observe(self, gbuffer: Any, direct: Any, indirect: Any, moment: int = 0) -> None:
+        """Adds one iteration's samples of irradiance over π, made at one of the moments."""
+        if self._blur is not None:
+            observe_blurred(self._blur, self._seen, moment, gbuffer, direct, indirect, self._launcher)
+        else:
+            observe(self._seen, gbuffer, direct, indirect, self._launcher)
 
     def arrays(self) -> dict[str, Any]:
         """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""
@@ -57,6 +61,8 @@ class Reconstruction:
 
     def passes(self, iterations: int) -> float:
         """How many times as long as camera rays through all pixels `resolve` will take, roughly."""
+        if self._blur is not None:
+            return _FILTER_PASSES + blur_rays(iterations)
         # Of two pixels next to an edge one is of one surface, and soon done.
         return _FILTER_PASSES + 0.5 * self._on_edges * edge_rays(iterations)
 
@@ -74,8 +80,13 @@ class Reconstruction:
             *layers, noise = carve(block, camera.columns * camera.rows, _TYPES)
             layer, other = new_layer(*layers[:2]), new_layer(*layers[2:])
             seen = average(self._seen, noise, layer, launcher)
-            if camera.blurs:
-                seen = without_mixed(seen, layer, iterations, launcher)
-            filtered = filter_layer(seen.surfaces, layer, other, launcher)
-            rows = compose(self._scene, camera, seen, filtered, film, iterations, self._exposure, features, launcher)
-            return np.asarray(rows.numpy()).reshape(-1, camera.rows, camera.columns, 3)
+            layer, rest = filter_layer(seen.surfaces, layer, other, launcher)
+            rays = edge_rays(iterations) if self._blur is None else blur_rays(iterations)
+            out = new_picture(seen.count.shape[0], rest, iterations, rays, features, launcher)
+            if self._blur is not None:
+                guess_noise(seen, launcher)
+                compose_blurred(self._blur, seen, layer, film, self._exposure, out, launcher)
+            else:
+                compose(self._scene, camera, seen, layer, film, self._exposure, out, launcher)
+            correct_edges(seen.surfaces, out, launcher)
+            return np.asarray(out.rows.numpy()).reshape(-1, camera.rows, camera.columns, 3)
