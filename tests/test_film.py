@@ -137,3 +137,20 @@ def test_cancelled_films_hold_whole_iterations(monkeypatch):
         films.append(film)
     assert films[1].iterations == 2
     np.testing.assert_array_equal(films[0].radiance(), films[1].radiance())
+
+
+def test_timings_and_counts_are_those_of_one_film():
+    """A renderer's films have their own rays and their own time; what comes before all belongs to the first."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=16, height=16, iterations=2, light_paths=16))
+    films = [renderer.render() for _ in range(3)]
+    rays = {film.counts["primary_rays"] for film in films}
+    assert rays == {3 * 256}  # two iterations, and the look through the centres
+    assert all(film.counts["iterations"] == 2 for film in films)
+    assert films[0].timings["upload"] > 0.0 and films[1].timings["upload"] == films[2].timings["upload"] == 0.0
+    # Every phase within the render is part of its time; reading the clock takes some as well.
+    for film in films:
+        assert sum(film.timings[phase] for phase in ("primary", "emission", "gather", "film")) <= film.seconds
+    again = renderer.render(films[1])  # nothing is left to do
+    assert again.counts["primary_rays"] == 3 * 256
+    total = sum(film.timings["gather"] for film in films)
+    assert total == pytest.approx(renderer.launcher.profile.seconds()["gather"])

@@ -151,7 +151,7 @@ class Film:
         self.settings: Any = None
         """The `RenderSettings` it was rendered with."""
         self.timings: dict[str, float] = {}
-        """Seconds by phase."""
+        """Seconds by phase; compiling and uploading belong to the first film after them."""
         self.counts: dict[str, int] = {}
         """Rays, VPLs, ... of all iterations."""
         self.reconstruction: Any = None

@@ -89,6 +89,7 @@ class Renderer:
         self.launcher = Launcher(device, threads)
         self._check_memory(scene)
         self.launcher.load(_modules(settings.estimator, self.launcher))
+        self._told: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._moments: list[_Moment] = []
         self._needs: dict[str, Any] = {}  # of the buffers
         self._take(scene)
@@ -102,6 +103,7 @@ class Renderer:
             InputError: The scene cannot be used.
         """
         self.launcher.profile.clear()
+        self._told = {}, {}
         self.settings = _with_height(self.wanted, scene)
         self._check_memory(scene)
         self._take(scene)
@@ -197,8 +199,7 @@ class Renderer:
                     break
         film.radiance()  # filtered now, and remembered: it belongs to the render and its time
         film.seconds = time.perf_counter() - start
-        film.timings = self.launcher.profile.seconds()
-        film.counts = {"iterations": film.iterations, **self.launcher.profile.counts}
+        self._tell(film)
         return film
 
     def _finishing_seconds(self, film: Film, looking: float) -> float:
@@ -209,6 +210,16 @@ class Renderer:
         if self.settings.denoise:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
+
+    def _tell(self, film: Film) -> None:
+        """Adds to a film's timings and counts what has happened since films were told last."""
+        seconds, counts = self.launcher.profile.seconds(), dict(self.launcher.profile.counts)
+        for phase in seconds:
+            film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._told[0].get(phase, 0.0)
+        for what in counts:
+            film.counts[what] = film.counts.get(what, 0) + counts[what] - self._told[1].get(what, 0)
+        film.counts["iterations"] = film.iterations
+        self._told = seconds, counts
 
     def _primary_seconds(self) -> float:
         """What camera rays have taken so far [s]; it tells what filtering will take."""
