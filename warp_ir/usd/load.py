@@ -59,7 +59,7 @@ _DOME = Light("default dome", LightKind.DOME, (1.0, 1.0, 1.0))
 _SLICES = 16
 """Moments that stand for the time in which the shutter is open."""
 _SLICED_TRIANGLES = 20_000_000
-"""Triangles of all moments together, beyond which there are fewer of them."""
+"""Triangles that move, of all moments together, beyond which there are fewer moments."""
 
 
 def load_usd(
@@ -230,11 +230,13 @@ class StageReader:
         deforms = bool(self._still.moving.shapes) or self._motion.rearranges
         if closes <= opens or not (deforms or self._still.moving.lights or self._motion.moves(camera)):
             return ()
+        # What stands still is there once for all moments.
+        moving = scene.triangle_count - sum(len(mesh.triangles) for mesh in self._still.geometry.meshes)
         count = _SLICES
-        while deforms and count > 2 and count * scene.triangle_count > _SLICED_TRIANGLES:
+        while count > 2 and count * moving > _SLICED_TRIANGLES:
             count //= 2
         if count < _SLICES:
-            report.warn(camera.GetPath(), f"motion blur of {count} moments, not {_SLICES}: the scene is large")
+            report.warn(camera.GetPath(), f"motion blur of {count} moments, not {_SLICES}: what moves is large")
         moments = [time + opens + (k + 0.5) / count * (closes - opens) for k in range(count)]
         unsaid = self._opened.part()
         return tuple(self._scene(Usd.TimeCode(moment), camera, spec, unsaid) for moment in moments)
