@@ -10,6 +10,7 @@ import pytest
 
 import warp_ir as ir
 from warp_ir.cli import main
+from warp_ir.procedural import cornell_box
 from warp_ir.usd.load import StageReader
 
 SCENES = Path(__file__).parent.parent / "scenes_usd"
@@ -200,6 +201,30 @@ def test_what_is_kept_is_checked_against_what_is_new():
     renderer = ir.Renderer(scene, ir.RenderSettings(width=4, iterations=1, light_paths=16))
     with pytest.raises(ir.InputError, match="material refers to materials outside"):
         renderer.update(replace(scene, materials=scene.materials[:1]))
+
+
+def test_the_sky_stays_where_a_lamp_or_a_mesh_moves(device):
+    """Images of lights are uploaded once; the picture is that of a new renderer, bit for bit."""
+    sky = ir.Light("sky", ir.LightKind.DOME, (1.0, 1.0, 1.0), texture=np.full((8, 16, 3), 0.5, np.float32))
+    shaping = ir.Shaping(cone_angle=30.0)
+    scene = cornell_box()
+    settings = ir.RenderSettings(width=8, height=8, iterations=1, light_paths=64)
+
+    def with_lamp(x, texture=sky.texture):
+        place = np.eye(4)
+        place[:3, 3] = x, 300.0, 100.0
+        lamp = ir.Light("lamp", ir.LightKind.SPHERE, (50.0,) * 3, world_from_light=place, radius=20.0, shaping=shaping)
+        return replace(scene, lights=(replace(sky, texture=texture), lamp))
+
+    renderer = ir.Renderer(with_lamp(100.0), settings, device=device)
+    there = renderer.scene.grids.upload(renderer.launcher)
+    moved = with_lamp(200.0)
+    renderer.update(moved)
+    assert renderer.scene.grids.upload(renderer.launcher) is there
+    fresh = ir.Renderer(moved, settings, device=device)
+    np.testing.assert_array_equal(renderer.render().radiance(), fresh.render().radiance())
+    renderer.update(with_lamp(200.0, np.ones((8, 16, 3), np.float32)))
+    assert renderer.scene.grids.upload(renderer.launcher) is not there
 
 
 def test_stats_say_what_was_kept(tmp_path):

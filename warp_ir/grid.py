@@ -5,6 +5,8 @@ A grid divides a rectangle evenly into cells; or the directions up to a polar an
 column; the place in it is uniform, by area or by solid angle. Values are interpolated between the centres of cells.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ _EVENLY = 0.01
 """Part of the samples that is spread evenly over what is not black: rounding must not make dark cells unreachable."""
 _STEPS = 2.0**24
 """Sample numbers are multiples of 1/_STEPS; cumulative probabilities too, so that every cell gets exactly its share."""
+_COMPARED = 2**18
+"""Numbers of a table up to which it is compared by its values."""
 
 
 @wp.struct
@@ -190,45 +194,76 @@ def value_along(tables: GridTables, index: int, d: wp.vec3) -> wp.vec3:
     return interpolate(tables, index, direction_place(tables.grids[index], d))
 
 
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """A grid on the host."""
+
+    values: Any
+    theta: float
+    weights: Any
+    keep: bool
+
+    def equals(self, other: "_Values") -> bool:
+        """Whether it is surely the same; large values are compared as objects."""
+        return (self.theta, self.keep) == (other.theta, other.keep) and all(
+            a is b or (a is not None and b is not None and max(a.size, b.size) <= _COMPARED and np.array_equal(a, b))
+            for a, b in ((self.values, other.values), (self.weights, other.weights))
+        )
+
+
 class GridList:
     """Grids on the host, to be uploaded together."""
 
-    def __init__(self) -> None:
-        self._grids: list[tuple[int, int, int, int, float]] = []
-        self._cdf: list[npt.NDArray[np.float32]] = []
-        self._texels: list[npt.NDArray[np.float32]] = []
-        self._cdf_length = self._texels_length = 0
+    def __init__(self, former: Sequence["GridList"] = ()) -> None:
+        """An empty list; if it comes to equal one of `former` ones, that one's tables are taken."""
+        self._former = former
+        self._grids: list[_Values] = []
+        self._tables: Any = None
 
     def add(self, values: Any, *, theta: float = 0.0, weights: Any = None, keep: bool = True) -> int:
         """Adds a grid and returns its index.
 
         Args:
-            values: [rows, columns, 3], not negative.
+            values: [rows, columns, 3], not negative; not to be changed any more.
             theta: Polar angle at which the last row ends [rad]; 0: over a rectangle.
             weights: [rows, columns], with which cells are drawn; None: the integral over the cell of the mean channel.
             keep: Whether the values will be looked up.
         """
-        rows, columns = values.shape[:2]
-        if weights is None:
-            weights = cell_means(values.mean(axis=2), around=theta > 0.0) * cell_measure(rows, theta)[:, None]
-        cdf = _cumulative(weights)
-        self._grids.append((rows, columns, self._cdf_length, self._texels_length, theta))
-        self._cdf.append(cdf)
-        self._cdf_length += len(cdf)
-        if keep:
-            self._texels.append(values.reshape(-1, 3).astype(np.float32))
-            self._texels_length += rows * columns
+        self._grids.append(_Values(values, theta, weights, keep))
         return len(self._grids) - 1
 
     def upload(self, launcher: Launcher) -> Any:
         """The `GridTables`; one unused row where there is nothing, since kernels never get a null pointer."""
+        if self._tables is None:
+            self._tables = next((f._tables for f in self._former if self._equals(f)), None) or self._upload(launcher)
+            self._former = ()
+        return self._tables
+
+    def _equals(self, other: "GridList") -> bool:
+        return len(self._grids) == len(other._grids) and all(
+            mine.equals(its) for mine, its in zip(self._grids, other._grids, strict=True)
+        )
+
+    def _upload(self, launcher: Launcher) -> Any:
         table = np.zeros(max(len(self._grids), 1), Grid.numpy_dtype())
-        for k, row in enumerate(self._grids):
-            table[k] = row
+        cdf, texels = [np.zeros(0 if self._grids else 1, np.float32)], [np.zeros((0, 3), np.float32)]
+        cdf_length = texels_length = 0
+        for k, grid in enumerate(self._grids):
+            rows, columns = grid.values.shape[:2]
+            weights = grid.weights
+            if weights is None:
+                weights = cell_means(grid.values.mean(axis=2), around=grid.theta > 0.0)
+                weights = weights * cell_measure(rows, grid.theta)[:, None]
+            table[k] = (rows, columns, cdf_length, texels_length, grid.theta)
+            cdf.append(_cumulative(weights))
+            cdf_length += len(cdf[-1])
+            if grid.keep:
+                texels.append(grid.values.reshape(-1, 3).astype(np.float32))
+                texels_length += rows * columns
         out = GridTables()
         out.grids = launcher.array(table, Grid)
-        out.cdf = launcher.array(np.concatenate(self._cdf) if self._cdf else np.zeros(1), wp.float32)
-        out.texels = launcher.array(np.concatenate(self._texels) if self._texels else np.zeros((1, 3)), wp.vec3)
+        out.cdf = launcher.array(np.concatenate(cdf), wp.float32)
+        out.texels = launcher.array(np.concatenate(texels) if texels_length else np.zeros((1, 3)), wp.vec3)
         return out
 
 

@@ -1,6 +1,7 @@
 """The tables of lights."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,20 @@ from warp_ir.scene import InputError, Light, LightKind, Scene
 
 
 def upload_lights(
-    scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher
-) -> tuple[Any, npt.NDArray[np.float64]]:
+    scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher, former: Sequence[GridList] = ()
+) -> tuple[Any, GridList, npt.NDArray[np.float64]]:
     """Fills the light tables.
 
+    Args:
+        scene: Whose lights.
+        frame: Of the device.
+        data: The `SceneData` to fill.
+        launcher: Whose device it is for.
+        former: Grids that are on the device already.
+
     Returns:
-        The owners of what is referred to by address, and what textures and shaping make of each light's power.
+        The owners of what is referred to by address, the grids, and what textures and shaping make of each light's
+        power.
     """
     lights = scene.lights
     axes = np.array([_light_axes(light) * _unit(light, frame) for light in lights]).reshape(-1, 3, 3)
@@ -30,7 +39,7 @@ def upload_lights(
     points = np.array([light.kind == LightKind.POINT for light in lights], bool)
     radiance[points] *= frame.scale**2  # intensity is radiance times area
     angle = [1.0 - math.cos(math.radians(0.5 * min(max(light.angle, 0.0), 360.0))) for light in lights]
-    grids = GridList()
+    grids = GridList(former)
     texture, gain = _add_textures(lights, grids)
     tables = LightTables()
     tables.controls, peak, share = upload_controls(lights, axes, scene.meshes, grids, launcher)
@@ -57,7 +66,7 @@ def upload_lights(
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
     data.shape_bvh = bvh.id
-    return (bvh, tables), gain * share
+    return (bvh, tables), grids, gain * share
 
 
 def _add_textures(lights: tuple[Light, ...], grids: GridList) -> tuple[list[int], npt.NDArray[np.float64]]:

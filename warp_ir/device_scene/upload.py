@@ -16,6 +16,7 @@ from warp_ir.device_scene.lights import upload_lights
 from warp_ir.device_scene.records import SceneData
 from warp_ir.device_scene.storage import arranged
 from warp_ir.device_scene.surfaces import Surfaces, same_objects
+from warp_ir.grid import GridList
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError, Scene, materials_of
 
@@ -52,6 +53,8 @@ class DeviceScene:
     """`source` as it is arranged in the tables ..."""
     rows: list[int]
     """... and the row of the first triangle of each of its meshes; -1: it has none."""
+    grids: GridList
+    """The images and the shaping of its lights."""
     bounds: tuple[float, ...]
     """Lower and upper corner of all moments together, in the world."""
 
@@ -96,17 +99,22 @@ def upload_moments(
         there = [_find(scene, valid) for scene in scenes]
         if all(there):
             return [replace(found, source=scene) for found, scene in zip(there, scenes, strict=True) if found]
-        return _upload(scenes, (lower, upper), frame, launcher, previous[0].surfaces if previous else None)
+        return _upload(scenes, (lower, upper), frame, launcher, previous)
 
 
 def _upload(
-    scenes: Sequence[Scene], bounds: tuple[Any, Any], frame: DeviceFrame, launcher: Launcher, surfaces: Surfaces | None
+    scenes: Sequence[Scene],
+    bounds: tuple[Any, Any],
+    frame: DeviceFrame,
+    launcher: Launcher,
+    previous: Sequence[DeviceScene],
 ) -> list[DeviceScene]:
-    """Scenes that are not all there; `surfaces` may have parts of them."""
+    """Scenes that are not all there; `previous` ones may have parts of them."""
     lower, upper = bounds
     extent = float(np.linalg.norm(upper - lower))
     stored = [arranged(scene) for scene in scenes]
-    lit: list[tuple[Any, Any, Any]] = []
+    lit: list[tuple[Any, Any, GridList, Any]] = []
+    grids = [other.grids for other in previous]
     for k, scene in enumerate(scenes):
         data = SceneData()
         like = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
@@ -118,11 +126,12 @@ def _upload(
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
         # Links name meshes by their numbers in the scene, not by where they are stored.
-        lit.append((data, *upload_lights(scene, frame, data, launcher)))
-    surfaces = surfaces or Surfaces(launcher)
+        lit.append((data, *upload_lights(scene, frame, data, launcher, grids)))
+        grids.append(lit[-1][2])
+    surfaces = previous[0].surfaces if previous else Surfaces(launcher)
     surfaces.take(stored, frame)
     done: list[DeviceScene] = []
-    for k, (scene, (data, shapes, gain)) in enumerate(zip(scenes, lit, strict=True)):
+    for k, (scene, (data, shapes, own, gain)) in enumerate(zip(scenes, lit, strict=True)):
         same = _find(scene, done)
         if same is not None:
             done.append(replace(same, source=scene))
@@ -151,6 +160,7 @@ def _upload(
                 changes=surfaces.changes,
                 stored=stored[k][0],
                 rows=rows,
+                grids=own,
                 bounds=(*lower, *upper),
             )
         )
