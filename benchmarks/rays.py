@@ -24,6 +24,7 @@ import warp_ir as ir
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
 from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
+from warp_ir.guide import unguided
 from warp_ir.launch import Launcher
 from warp_ir.surface import closest, visible
 from warp_ir.vpl import VplBuffer, emit_vpls
@@ -179,7 +180,12 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     gbuffer, *_ = new_gbuffer(launcher, width * width, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
-        uploaded, launcher, paths=PATHS, absorption="roulette", max_bounces=settings.bounce_limit, scramble=1
+        unguided(uploaded, launcher),
+        launcher,
+        paths=PATHS,
+        absorption="roulette",
+        max_bounces=settings.bounce_limit,
+        scramble=1,
     )
     try:
         embree = Embree(uploaded, launcher.threads) if device == "cpu" else None

@@ -16,7 +16,8 @@ from typing import Any
 import warp as wp
 
 from warp_ir.bvh import on_cuda
-from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.device_scene import SceneData
+from warp_ir.guide import Guide
 from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
 from warp_ir.lights import Bound, arriving, bound_on
@@ -402,11 +403,13 @@ def _divide(vpls: Any, count: int) -> Any:
     return lit
 
 
-def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any]:
+def arrange(vpls: Any, guide: Guide, launcher: Launcher) -> tuple[Any, Any]:
     """The `VplSets` of the VPLs on lights and of those on surfaces.
 
-    The area of the scene's surfaces and the number of VPLs that a pixel weighs give the bound on G.
+    The area of the scene's surfaces, the number of VPLs that a pixel weighs and how densely the guide puts them give
+    the bound on G.
     """
+    scene = guide.scene
     lights, surfaces = _divide(vpls, vpls.on_lights), _divide(vpls, vpls.count - vpls.on_lights)
     weighed = LANES * max(lights.blocks + surfaces.blocks, 1)
     packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
@@ -414,7 +417,9 @@ def arrange(vpls: Any, scene: DeviceScene, launcher: Launcher) -> tuple[Any, Any
     keys = launcher.kept("gather.keys", max(2 * vpls.count, 1), wp.int32)
     order = launcher.kept("gather.order", max(2 * vpls.count, 1), wp.int32)
     for lit, name, begin in ((lights, "lights", 0), (surfaces, "surfaces", vpls.on_lights)):
-        lit.bound.least = math.pi * weighed / (_AREAS * scene.area) if scene.area > 0.0 else _INFINITE
+        lit.bound.least = _INFINITE
+        if scene.area > 0.0:
+            lit.bound.least = math.pi * weighed * guide.density / (_AREAS * scene.area)
         lit.bound.per_density = math.pi * LANES * lights.blocks / _AREAS
         lit.order = order[begin:] if lit.count else order
         blocks = lit.sets * lit.blocks if packed else 0

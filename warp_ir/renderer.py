@@ -30,6 +30,7 @@ import warp_ir.estimators.vpl
 import warp_ir.film
 import warp_ir.gather
 import warp_ir.gbuffer
+import warp_ir.pilot.probes
 import warp_ir.reconstruction.blur
 import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
@@ -42,6 +43,7 @@ from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, uploa
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film import Film
 from warp_ir.gbuffer import new_gbuffer
+from warp_ir.guide import unguided
 from warp_ir.launch import Cancelled, Launcher
 from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling import iteration_scramble, stratum
@@ -269,7 +271,7 @@ def _with_height(settings: RenderSettings, scene: Scene) -> RenderSettings:
 def trace_vpls(
     scene: Scene, settings: RenderSettings | None = None, *, device: str = "cpu", iteration: int = 0
 ) -> Vpls:
-    """The VPLs of one iteration, in world space.
+    """The VPLs of one iteration, in world space, as if the whole scene was seen.
 
     Args:
         scene: Where to trace; empty arrays come back if nothing in it emits.
@@ -281,7 +283,7 @@ def trace_vpls(
     launcher = Launcher(device)
     uploaded = upload_scene(scene, launcher)
     vpls = emit_vpls(
-        uploaded,
+        unguided(uploaded, launcher),
         launcher,
         paths=settings.path_count,
         absorption=settings.path_end,
@@ -299,6 +301,7 @@ def _modules(estimator: str, launcher: Launcher) -> list[Any]:
             warp_ir.gbuffer,
             warp_ir.estimators.vpl,
             warp_ir.vpl,
+            warp_ir.pilot.probes,
             warp_ir.reconstruction.compose,
             *common,
             warp_ir.gather,

@@ -19,8 +19,9 @@ import warp as wp
 
 from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.guide import Guide, Worth, kept_probability
 from warp_ir.launch import Launcher
-from warp_ir.lights import emit, land, sample_light
+from warp_ir.lights import Aim, emit, land, sample_light
 from warp_ir.surface import albedo, closest, scene_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -33,6 +34,7 @@ _MAX_REFLECTIVITY = 0.98
 # Dimensions 0-1: where on the light (the best pair), 2: which light, 3-4: direction, 5-6: place of a distant photon.
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
+_KEEPING = wp.constant(wp.uint32(0x9E6C63D0))  # parts the coins by which VPLs are kept from the paths' sequence
 _FOLLOWED_AGAIN = 0.02
 """About the share of the paths that may be longer than what is noted of them."""
 _MOST_NOTED = 2**22
@@ -41,7 +43,7 @@ _MOST_NOTED = 2**22
 
 @wp.struct
 class VplBuffer:
-    """VPLs in the scene's device frame, first those on lights, one per path, then those on surfaces, path by path.
+    """VPLs in the scene's device frame, first those on lights, then those on surfaces, path by path.
 
     Positions and normals are homogeneous, as in `lights`.
     """
@@ -62,30 +64,40 @@ class PathSettings:
 
     scramble: wp.uint32
     paths: int
+    on_lights: int  # of them, whose point on the light is a VPL
     max_bounces: int
     fractional: int  # 1: the first survivors[j] paths are reflected j times; 0: roulette by the local albedo
     survivors: wp.array[wp.int32]
     levels: int  # length of survivors
-    noted: int  # reflections of a path that are noted while it is traced
+    noted: int  # VPLs of a path that are noted while it is traced
+    aim: Aim
+    worth: Worth
+
+
+@wp.func
+def _coin(scramble: wp.uint32, path: int, bounce: int) -> float:
+    """Uniform in [0, 1), for every VPL."""
+    bits = sampling.hash_combine(sampling.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
+    return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
 
 
 @wp.func(inline=False)
 def _follow(
     address: wp.uint64, settings: PathSettings, i: int, vpls: VplBuffer, begin: int, step: int, kept: int, most: int
 ) -> int:
-    """Follows path `i` and returns how often it is reflected.
+    """Follows path `i` and returns how many VPLs it leaves on surfaces.
 
-    Its point on the light goes to row i of `vpls`, reflection j to row `begin` + (j - 1) `step`, if kept < j <= most.
+    Its point on the light goes to row i of `vpls`, VPL j to row `begin` + (j - 1) `step`, if kept < j <= most.
     """
     scene = scene_at(address)[0]
     u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
     u = sampling.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     share = 1.0 / float(settings.paths)
-    if kept == 0:
+    if kept == 0 and i < settings.on_lights:
         vpls.position[i] = light.position
         vpls.normal[i] = light.normal
-        vpls.intensity[i] = light.intensity * share
+        vpls.intensity[i] = light.intensity / float(settings.on_lights)
         vpls.bounce[i] = 0
         vpls.density[i] = scene.emitter_density[light.emitter]
         if scene.control_count > 0:
@@ -94,6 +106,7 @@ def _follow(
     photon = emit(
         scene,
         light,
+        settings.aim,
         sampling.sample_2d(scene.sobol, i, 3, settings.scramble),
         sampling.sample_2d(scene.sobol, i, 5, settings.scramble),
     )
@@ -102,6 +115,7 @@ def _follow(
     flux = photon.flux
     dimension = int(_FIRST_BOUNCE_DIMENSION)
     bounce = int(1)
+    left = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
         if bounce == 1 and light.control >= 0:
@@ -124,28 +138,44 @@ def _follow(
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
             break
-        if bounce > kept and bounce <= most:
-            row = begin + (bounce - 1) * step
-            vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
-            vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-            vpls.intensity[row] = flux * (share / wp.pi)
-            vpls.bounce[row] = bounce
+        intensity = flux * (share / wp.pi)
+        survives = bool(True)
+        if settings.worth.known == 1:
+            probability = kept_probability(settings.worth, hit.position, hit.normal, intensity)
+            intensity = intensity / probability
+            survives = _coin(settings.scramble, i, bounce) < probability
+        if survives:
+            left += 1
+            if left > kept and left <= most:
+                row = begin + (left - 1) * step
+                vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
+                vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
+                vpls.intensity[row] = intensity
+                vpls.bounce[row] = bounce
         origin = hit.position
         u = sampling.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = sampling.to_cosine_hemisphere(u, hit.normal)
         dimension += 3
         bounce += 1
-    return bounce - 1
+    return left
 
 
 @wp.kernel
 def _trace_paths(
     first: int, scene: SceneData, settings: PathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
 ) -> None:
-    """Follows path `i` and notes its light and its first reflections, those of all paths side by side."""
+    """Follows path `i` and notes its light and its first VPLs on surfaces, those of all paths side by side."""
     i = first + wp.tid()
-    begin = settings.paths + i
+    begin = settings.on_lights + i
     lengths[i] = _follow(scene.address, settings, i, traced, begin, settings.paths, 0, settings.noted)
+
+
+@wp.func
+def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int) -> None:
+    target.position[to] = source.position[row]
+    target.normal[to] = source.normal[row]
+    target.intensity[to] = source.intensity[row]
+    target.bounce[to] = source.bounce[row]
 
 
 @wp.kernel
@@ -158,19 +188,16 @@ def _store_paths(
     ends: wp.array[wp.int32],
     vpls: VplBuffer,
 ) -> None:
-    """Puts path `i` where it belongs: its light in row i, its reflections behind those of the paths before it."""
+    """Puts path `i` where it belongs: its light in row i, its other VPLs behind those of the paths before it."""
     i = first + wp.tid()
-    begin = settings.paths + ends[i] - lengths[i]
-    for k in range(wp.min(lengths[i], settings.noted) + 1):
-        source = settings.paths * k + i
-        row = wp.where(k == 0, i, begin + k - 1)
-        vpls.position[row] = traced.position[source]
-        vpls.normal[row] = traced.normal[source]
-        vpls.intensity[row] = traced.intensity[source]
-        vpls.bounce[row] = k
-    vpls.density[i] = traced.density[i]
-    if scene.control_count > 0:
-        vpls.control[i] = traced.control[i]
+    begin = settings.on_lights + ends[i] - lengths[i]
+    for k in range(wp.min(lengths[i], settings.noted)):
+        _copy(traced, settings.on_lights + settings.paths * k + i, vpls, begin + k)
+    if i < settings.on_lights:
+        _copy(traced, i, vpls, i)
+        vpls.density[i] = traced.density[i]
+        if scene.control_count > 0:
+            vpls.control[i] = traced.control[i]
     if lengths[i] > settings.noted:
         _follow(scene.address, settings, i, vpls, begin, 1, settings.noted, lengths[i])
 
@@ -187,7 +214,7 @@ def survivors(paths: int, mean_albedo: float) -> npt.NDArray[np.int32]:
 
 
 def emit_vpls(
-    scene: DeviceScene,
+    guide: Guide,
     launcher: Launcher,
     *,
     paths: int,
@@ -200,18 +227,21 @@ def emit_vpls(
     Its arrays are the launcher's, have room to spare, and are overwritten by the next call.
 
     Args:
-        scene: The uploaded scene.
+        guide: The uploaded scene, and where in it paths go.
         launcher: Where to run.
-        paths: Light paths to start.
+        paths: VPLs on lights; as many light paths are started, times those of the guide.
         absorption: "fractional" or "roulette".
         max_bounces: Longest chain of reflections.
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
+    scene, on_lights = guide.scene, paths
     if not scene.emits:
         return _buffer(scene, launcher, "vpls", 0, 0)
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
-    settings.paths = paths
+    paths *= guide.paths
+    settings.paths, settings.on_lights = paths, on_lights
+    settings.aim, settings.worth = guide.aim, guide.worth
     settings.max_bounces = max_bounces
     settings.survivors = launcher.kept("survivors", 1, wp.int32)
     if absorption == "fractional":
@@ -222,10 +252,10 @@ def emit_vpls(
 
     # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
     lengths, ends = launcher.kept("lengths", paths, wp.int32), launcher.kept("ends", paths, wp.int32)
-    traced = _buffer(scene, launcher, "traced", paths, paths * settings.noted)
+    traced = _buffer(scene, launcher, "traced", on_lights, paths * settings.noted)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
-    vpls = _buffer(scene, launcher, "vpls", paths, int(ends[paths - 1 : paths].numpy()[0]))
+    vpls = _buffer(scene, launcher, "vpls", on_lights, int(ends[paths - 1 : paths].numpy()[0]))
     launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls])
     launcher.profile.counts["light_paths"] += paths
     launcher.profile.counts["vpls"] += vpls.count

@@ -22,6 +22,7 @@ import warp as wp
 
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.guide import unguided
 from warp_ir.launch import Launcher
 from warp_ir.lights import arriving
 from warp_ir.sampling import iteration_scramble
@@ -99,7 +100,7 @@ class Keller:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
         with launcher.phase("emission"):
             vpls = emit_vpls(
-                self._scene,
+                unguided(self._scene, launcher),
                 launcher,
                 paths=settings.path_count,
                 absorption=settings.path_end,

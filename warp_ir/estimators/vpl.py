@@ -20,8 +20,10 @@ from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gather import Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.guide import Guide
 from warp_ir.launch import Launcher
 from warp_ir.lights import cut_share, lights_beyond, surface_beyond
+from warp_ir.pilot import learn
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.vpl import emit_vpls
@@ -157,6 +159,7 @@ class VplGatherer:
     def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
         """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
         self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+        self._guide: Guide | None = None
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
@@ -166,16 +169,20 @@ class VplGatherer:
         def look() -> None:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
 
+        if self._guide is None:
+            with launcher.phase("pilot"):
+                self._guide = learn(self._scene, self._camera, launcher, settings)
+        guide = self._guide
         with launcher.beside("primary", look), launcher.phase("emission"):
             vpls = emit_vpls(
-                self._scene,
+                guide,
                 launcher,
                 paths=settings.path_count,
                 absorption=settings.path_end,
                 max_bounces=settings.bounce_limit,
                 scramble=scramble,
             )
-            lights, surfaces = arrange(vpls, self._scene, launcher)
+            lights, surfaces = arrange(vpls, guide, launcher)
         how = GatherSettings()
         how.columns = self._camera.columns
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
@@ -186,5 +193,5 @@ class VplGatherer:
             launcher.launch(
                 _gather_pixels,
                 gbuffer.mesh.shape[0],
-                [self._scene.data, gbuffer, lights, surfaces, how, direct, indirect],
+                [guide.scene.data, gbuffer, lights, surfaces, how, direct, indirect],
             )

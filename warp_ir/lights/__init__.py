@@ -7,15 +7,17 @@ from warp_ir.lights.arriving import arriving
 from warp_ir.lights.beyond import Bound, bound_on, cut_share, lights_beyond, surface_beyond
 from warp_ir.lights.found import lights_found, surface_found, surface_seen
 from warp_ir.lights.next_event import Arrival, power_heuristic, sample_arrival
-from warp_ir.lights.photons import emit, land
-from warp_ir.lights.points import LightPoint, sample_light
+from warp_ir.lights.photons import Aim, emit, land
+from warp_ir.lights.points import LightPoint, choose_emitter, sample_light
 
 __all__ = [
+    "Aim",
     "Arrival",
     "Bound",
     "LightPoint",
     "arriving",
     "bound_on",
+    "choose_emitter",
     "cut_share",
     "emit",
     "land",

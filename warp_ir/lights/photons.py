@@ -22,17 +22,37 @@ class Emission:
     flux: wp.vec3  # [W]
 
 
+@wp.struct
+class Aim:
+    """Where photons from far away go: more of them pass close by a focus, if there is one.
+
+    Seen from the light, rings lie around the focus; each is half as wide as the next and has a probability of its own.
+    """
+
+    rings: int  # 0: photons go everywhere alike
+    focus: wp.array[wp.vec4]  # [lights], x, y, z, and the outer radius of the last ring; that covers the scene
+    cdf: wp.array[wp.float32]  # [lights, rings + 1], of the rings of every light, from 0 to 1
+
+
 @wp.func
-def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emission:
+def emit(scene: SceneData, point: LightPoint, aim: Aim, u: wp.vec2, v: wp.vec2) -> Emission:
     """A photon from a point on an emitter: `u` gives its direction, `v` the place of one from far away."""
     out = Emission()
     xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
     if point.position[3] == 0.0:
         # Parallel light enters through a disk that covers the scene, seen from there.
-        d = sampling.to_disk(v)
-        out.origin = scene.centre + scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
         out.direction = -xyz
-        out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
+        if aim.rings == 0:
+            d = sampling.to_disk(v)
+            out.origin = scene.centre + scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
+            out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
+        else:
+            entry = _aimed(aim, scene.emitter_item[point.emitter], v)
+            focus = aim.focus[scene.emitter_item[point.emitter]]
+            away = sampling.to_frame(wp.vec3(entry[0], entry[1], 0.0), xyz)
+            out.origin = wp.vec3(focus[0], focus[1], focus[2]) + away
+            out.origin += (scene.radius - wp.dot(out.origin - scene.centre, xyz)) * xyz
+            out.flux = point.intensity * entry[2]
     elif point.normal[3] == 1.0:
         out.origin = xyz
         out.direction = sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
@@ -44,6 +64,23 @@ def emit(scene: SceneData, point: LightPoint, u: wp.vec2, v: wp.vec2) -> Emissio
     if point.control >= 0:
         out = _shaped(scene.address, point, u, out)
     return out
+
+
+@wp.func
+def _aimed(aim: Aim, light: int, v: wp.vec2) -> wp.vec3:
+    """Where a photon passes the focus, in the plane across its way, and the area over the probability of the ring."""
+    begin = light * (aim.rings + 1)
+    ring = int(0)
+    while ring < aim.rings - 1 and aim.cdf[begin + ring + 1] <= v[0]:
+        ring += 1
+    probability = aim.cdf[begin + ring + 1] - aim.cdf[begin + ring]
+    outer = aim.focus[light][3] / float(1 << (aim.rings - 1 - ring))
+    inner = wp.where(ring == 0, 0.0, 0.5 * outer)
+    rest = (v[0] - aim.cdf[begin + ring]) / probability
+    r = wp.sqrt(inner * inner + rest * (outer * outer - inner * inner))
+    phi = 2.0 * wp.pi * v[1]
+    area = wp.pi * (outer * outer - inner * inner)
+    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), area / probability)
 
 
 @wp.func(inline=False)

@@ -1,0 +1,63 @@
+"""The pilot: a small look at the scene that learns where light paths should go, once for every camera.
+
+Light paths begin on emitters in proportion to power. Of a hundred lit rooms the camera may see one: then so do a
+hundredth of the VPLs. Some hundred camera paths ask at each of their vertices for the light of random emitters, shadows
+and all, and some hundred light paths leave VPLs that are connected with what the camera sees. That tells
+
+* how much of the picture is due to each emitter              emitters.py
+* close by which point the light from far away passes          rings.py
+* what VPLs give to the picture, by where they are             worth.py
+
+Half of the samples learn, the other half measures what would be gained; where that is little, nothing changes. All
+of it is a pure function of the scene, the camera, the size of the image and the seed: whoever renders
+some iterations of a picture, or a part of it, learns the same.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+from warp_ir.device_scene import DeviceScene
+from warp_ir.guide import Guide, unguided
+from warp_ir.launch import Launcher
+from warp_ir.pilot.emitters import choose_emitters
+from warp_ir.pilot.probes import connect, look
+from warp_ir.pilot.rings import aim_at_foci
+from warp_ir.pilot.worth import judge
+from warp_ir.settings import RenderSettings
+
+_FEWEST, _MOST = 256, 2048
+"""Camera paths; one for every sixteen pixels within these limits, so that they take a small part of an iteration."""
+_MOST_PATHS = 16
+_PIXELS_PER_PATH = 2
+"""Of the image at least, for every light path that is started: so the paths remain cheap next to the gathering."""
+
+
+def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderSettings) -> Guide:
+    """Sends the pilot, and returns where light paths should go.
+
+    What it has decided is in the launcher's counts: `guided_emitters`, `guided_far_lights`, `guided_vpls` are 1 or 0.
+
+    Args:
+        scene: Where.
+        camera: The `CameraData` of what is to be rendered; of it the whole image counts, whatever part is rendered.
+        launcher: Where to run.
+        settings: With a definite width and height.
+    """
+    guide = unguided(scene, launcher)
+    pixels = camera.image_columns * camera.image_rows
+    paths = min(max(pixels // 16, _FEWEST), _MOST)
+    chosen = aim = worth = None
+    if scene.emits:
+        sightings = look(scene, camera, launcher, paths, settings)
+        if sightings.score.any():
+            chosen, aim = choose_emitters(scene, sightings, launcher), aim_at_foci(scene, sightings, launcher)
+            guide = replace(guide, scene=chosen or scene, aim=aim or guide.aim)
+            worth = judge(connect(guide, launcher, sightings, paths // 2, settings), guide, launcher)
+    if worth is not None:
+        most = min(max(pixels // (_PIXELS_PER_PATH * settings.path_count), 1), _MOST_PATHS)
+        paths = min(max(round(1.0 / worth.kept), 1), most)
+        guide = replace(guide, worth=worth.table, paths=paths, density=worth.density)
+    decided = {"guided_emitters": chosen, "guided_far_lights": aim, "guided_vpls": worth}
+    for name, learned in decided.items():
+        launcher.profile.counts[name] = int(learned is not None)
+    return guide
