@@ -1,0 +1,167 @@
+"""Light paths go where the camera feels them, and the light is the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warp_ir as ir
+import warp_ir.estimators.vpl
+from warp_ir.guide import CELLS, SIDES, unguided
+from warp_ir.metrics import z_scores
+from warp_ir.pilot.emitters import BY_POWER, probabilities
+from warp_ir.pilot.rings import nearest_point
+from warp_ir.pilot.worth import means
+from warp_ir.procedural import cornell_box
+from warp_ir.renderer import Renderer
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
+
+
+@pytest.fixture
+def wide(monkeypatch):
+    """The module with the scenes of which the camera sees a small part."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import wide_scenes
+
+    return wide_scenes
+
+
+def film_of(scene, *, threads=None, device="cpu", **settings):
+    settings = ir.RenderSettings(**{"width": 24, "height": 24, "filter": False, "light_paths": 512, **settings})
+    return Renderer(scene, settings, device=device, threads=threads).render()
+
+
+def without_pilot(monkeypatch):
+    monkeypatch.setattr(
+        warp_ir.estimators.vpl, "learn", lambda scene, camera, launcher, settings: unguided(scene, launcher)
+    )
+
+
+@pytest.mark.parametrize(
+    "name, guided",
+    [
+        ("rooms", {"guided_emitters", "guided_vpls"}),
+        ("terrain", {"guided_far_lights", "guided_vpls"}),
+        ("house", {"guided_far_lights", "guided_vpls"}),
+    ],
+)
+def test_light_is_the_same(wide, name, guided, device):
+    """Guided VPLs and path tracing, which knows of no guide, agree: the mean of z² is 1, as far as errors are known.
+
+    Pixels share their VPLs: the mean of all of them has the standard error of its spread over the iterations.
+    """
+    scene = getattr(wide, name)()
+    truth = film_of(scene, estimator="path", iterations=600, device=device)
+    film, means_ = None, []
+    settings = ir.RenderSettings(width=24, height=24, filter=False, light_paths=512, iterations=200)
+    renderer = Renderer(scene, settings, device=device)
+    film = renderer.new_film()
+    for k in range(200):
+        one = renderer.new_film()
+        renderer.add_iteration(one, k)
+        means_.append(float(one.radiance().mean(dtype=np.float64)))
+        film.merge(one)
+    assert {key for key in GUIDED if renderer.launcher.profile.counts[key]} == guided
+    z = z_scores(film.radiance(), film.standard_error(), truth.radiance(), truth.standard_error())
+    assert 0.8 < np.mean(z**2) < 1.25
+    reference = truth.radiance().mean(dtype=np.float64)
+    error = np.hypot(np.std(means_, ddof=1) / len(means_) ** 0.5, truth.standard_error().mean() / 24)
+    assert abs(np.mean(means_) - reference) < 4.0 * error
+    assert error < 0.05 * reference
+
+
+def test_noise_is_much_less(wide, monkeypatch, device):
+    """In one of a hundred rooms, and in a house with sun in a window, an iteration has a third of the variance."""
+    for scene in (wide.rooms(), wide.house()):
+        errors = []
+        for guided in (True, False):
+            with monkeypatch.context() as patch:
+                if not guided:
+                    without_pilot(patch)
+                film = film_of(scene, width=48, height=48, light_paths=1024, iterations=24, device=device)
+            errors.append(film.error() ** 2)
+        assert errors[0] < errors[1] / 1.8
+
+
+def test_nothing_changes_where_little_is_gained(monkeypatch, device):
+    """In the Cornell box the camera feels all light: the same bits as without a pilot."""
+    guided = film_of(cornell_box(), iterations=2, width=64, height=64, device=device)
+    assert [guided.counts[name] for name in GUIDED] == [0, 0, 0]
+    without_pilot(monkeypatch)
+    assert np.array_equal(guided.radiance(), film_of(cornell_box(), iterations=2, width=64, height=64).radiance())
+
+
+def test_the_same_bits(wide, tmp_path):
+    """On any number of threads, resumed, cut from the whole picture, and of a picture rendered again."""
+    scene = wide.rooms()
+    whole = film_of(scene, iterations=4, threads=1)
+    assert whole.counts["guided_vpls"] == 1
+    assert np.array_equal(whole.radiance(), film_of(scene, iterations=4, threads=3).radiance())
+    film_of(scene, iterations=2).save(tmp_path / "film.npz")
+    settings = ir.RenderSettings(width=24, height=24, filter=False, light_paths=512, iterations=4)
+    renderer = Renderer(scene, settings)
+    film = renderer.new_film()
+    film.resume(tmp_path / "film.npz")
+    assert np.array_equal(renderer.render(film).radiance(), whole.radiance())
+    renderer.update(replace(scene, camera=wide.house().camera))
+    assert not np.array_equal(renderer.render().radiance(), whole.radiance())
+    renderer.update(scene)
+    assert np.array_equal(renderer.render().radiance(), whole.radiance())
+    part = film_of(scene, iterations=4, data_window=(0.25, 0.25, 0.75, 0.75))
+    assert np.array_equal(part.radiance(), whole.radiance()[6:18, 6:18])
+
+
+def test_twice_the_light(wide):
+    """Twice the light is twice the film, bit for bit: nothing that is learned has a unit."""
+    scene = wide.rooms()
+    brighter = tuple(
+        replace(m, emission=(2 * m.emission[0], 2 * m.emission[1], 2 * m.emission[2])) for m in scene.materials
+    )
+    film, twice = film_of(scene, iterations=2), film_of(replace(scene, materials=brighter), iterations=2)
+    assert film.counts["guided_vpls"] == twice.counts["guided_vpls"] == 1
+    assert np.array_equal(2.0 * film.radiance(), twice.radiance())
+
+
+def test_black_pictures_are_black(wide):
+    """A camera that sees nothing, or no light, teaches nothing."""
+    away = ir.Camera.look_at((0, 0, 500), (0, 0, 1000), up=(0, 1, 0))
+    assert film_of(replace(wide.rooms(2), camera=away), iterations=1).radiance().max() == 0.0
+    dark = replace(wide.rooms(2), materials=tuple(replace(m, emission=(0, 0, 0)) for m in wide.rooms(2).materials))
+    assert film_of(dark, iterations=1).radiance().max() == 0.0
+
+
+def test_probabilities_of_emitters():
+    """What is unknown goes by power, what is known by what came; and a share by power everywhere."""
+    power = np.array([0.1, 0.2, 0.3, 0.15, 0.25])
+    unknown = probabilities(power, np.zeros(0, np.int64), np.zeros(0))
+    assert np.allclose(unknown, power, rtol=1e-12)
+    emitter = np.repeat([1, 4], 10**6)
+    known = probabilities(power, emitter, np.repeat([3.0, 1.0], 10**6))
+    expected = BY_POWER * power + (1.0 - BY_POWER) * np.array([0.0, 0.75, 0.0, 0.0, 0.25])
+    assert np.allclose(known, expected, atol=1e-4)
+    assert np.isclose(known.sum(), 1.0, rtol=1e-12) and (known >= BY_POWER * power).all()
+
+
+def test_where_lines_meet():
+    """Lines through a point come closest there; parallel ones in the middle."""
+    random = np.random.default_rng(0)
+    ways = random.normal(size=(50, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    window = np.array([0.1, -0.2, 0.05])
+    points = window + ways * random.uniform(0.1, 0.3, (50, 1))
+    assert np.allclose(nearest_point(points, ways, np.ones(50)), window, atol=2e-3)
+    down = np.tile([0.0, 0.0, 1.0], (4, 1))
+    square = np.array([[1, 1, 0], [-1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+    assert np.allclose(nearest_point(square, down, np.ones(4)), 0.0, atol=1e-6)
+
+
+def test_worth_of_cells():
+    """Many VPLs tell the mean of their cell; where there are none, it is that of the cells around."""
+    cell = np.repeat([0, 1], 10**5)
+    table = means(cell, np.ones(2 * 10**5), np.repeat([2.0, 4.0], 10**5))
+    assert table.shape == (SIDES * CELLS**3,)
+    assert np.allclose(table[:2], [2.0, 4.0], rtol=1e-3)
+    assert np.isclose(table[CELLS], 3.0, rtol=1e-3) and np.isclose(table[-1], 3.0, rtol=1e-3)
