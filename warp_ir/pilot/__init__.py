@@ -25,7 +25,7 @@ from warp_ir.pilot.rings import aim_at_foci
 from warp_ir.pilot.worth import judge
 from warp_ir.settings import RenderSettings
 
-_FEWEST, _MOST = 256, 2048
+_FEWEST, _MOST = 1024, 2048
 """Camera paths; one for every sixteen pixels within these limits, so that they take a small part of an iteration."""
 _MOST_PATHS = 16
 _PIXELS_PER_PATH = 2
@@ -46,15 +46,17 @@ def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderS
     guide = unguided(scene, launcher)
     pixels = camera.image_columns * camera.image_rows
     paths = min(max(pixels // 16, _FEWEST), _MOST)
+    # VPLs are dropped only where more paths can make up for them: else there would be less noise, but in larger spots.
+    most = min(pixels // (_PIXELS_PER_PATH * settings.path_count), _MOST_PATHS)
     chosen = aim = worth = None
     if scene.emits:
         sightings = look(scene, camera, launcher, paths, settings)
         if sightings.score.any():
             chosen, aim = choose_emitters(scene, sightings, launcher), aim_at_foci(scene, sightings, launcher)
             guide = replace(guide, scene=chosen or scene, aim=aim or guide.aim)
-            worth = judge(connect(guide, launcher, sightings, paths // 2, settings), guide, launcher)
+            if most > 1:
+                worth = judge(connect(guide, launcher, sightings, paths // 2, settings), guide, launcher)
     if worth is not None:
-        most = min(max(pixels // (_PIXELS_PER_PATH * settings.path_count), 1), _MOST_PATHS)
         paths = min(max(round(1.0 / worth.kept), 1), most)
         guide = replace(guide, worth=worth.table, paths=paths, density=worth.density)
     decided = {"guided_emitters": chosen, "guided_far_lights": aim, "guided_vpls": worth}

@@ -148,7 +148,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
     scramble = sampling.iteration_scramble(settings.seed, _CAMERA_PATHS)
     launcher.launch(_look, paths, [scene.data, whole, wp.uint32(scramble), rows])
 
-    emitter, score = rows.emitter.numpy(), _finite(rows.score)
+    emitter, score = rows.emitter.numpy(), _finite(rows.score.numpy())
     bounce = np.arange(n) // _ASKED % _VERTICES
     there = (emitter >= 0) & (bounce <= settings.bounce_limit)
     score[~there] = 0.0
@@ -175,10 +175,8 @@ def clipped(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.minimum(values, _MOST * values.mean()) if len(values) else values
 
 
-def _finite(array: Any) -> npt.NDArray[np.float64]:
-    values = array.numpy().astype(np.float64)
-    values[~np.isfinite(values)] = 0.0
-    return np.asarray(values)
+def _finite(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    return np.where(np.isfinite(values), values, np.float32(0.0)).astype(np.float64)
 
 
 @wp.kernel
@@ -249,7 +247,7 @@ def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, setti
     launcher.launch(_connect, n, [scene.data, seen.rows, vpls, rows, extent, cells, gives])
     return Connections(
         cell=cells.numpy()[:n].astype(np.int64),
-        intensity=_finite(vpls.intensity)[chosen].sum(axis=1),
-        gives=_finite(gives)[: n * _CONNECTIONS].reshape(n, _CONNECTIONS).mean(axis=1),
+        intensity=_finite(vpls.intensity.numpy()[chosen]).sum(axis=1),
+        gives=_finite(gives.numpy()[: n * _CONNECTIONS]).reshape(n, _CONNECTIONS).mean(axis=1),
         extent=extent,
     )
