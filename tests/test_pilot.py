@@ -29,6 +29,12 @@ def wide(monkeypatch):
     return wide_scenes
 
 
+@pytest.fixture(autouse=True)
+def from_the_first_iteration(monkeypatch):
+    """Guides all iterations."""
+    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 0)
+
+
 def film_of(scene, *, threads=None, device="cpu", **settings):
     settings = ir.RenderSettings(**{"width": 24, "height": 24, "filter": False, "light_paths": 64, **settings})
     return Renderer(scene, settings, device=device, threads=threads).render()
@@ -94,11 +100,24 @@ def test_noise_is_less(wide, monkeypatch, name, gains, device):
 
 
 def test_nothing_changes_where_little_is_gained(monkeypatch, device):
-    """In the Cornell box the camera feels all light: the same bits as without a pilot."""
-    guided = film_of(cornell_box(), iterations=2, width=64, height=64, device=device)
+    """In the Cornell box the camera feels all light: the same bits as without a pilot, and of one lamp none is sent."""
+    how = {"iterations": 2, "width": 64, "height": 64}
+    alone = film_of(cornell_box(), device=device, **how)
+    assert not any(name in alone.counts for name in GUIDED)
+    monkeypatch.setattr("warp_ir.pilot._APART", 0.0)
+    guided = film_of(cornell_box(), device=device, **how)
     assert [guided.counts[name] for name in GUIDED] == [0, 0, 0]
+    assert np.array_equal(guided.radiance(), alone.radiance())
+
+
+def test_short_pictures_have_no_pilot(wide, monkeypatch):
+    """The first iterations are those without a guide; the ones after them are guided."""
+    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 2)
+    short, long = (film_of(wide.rooms(), iterations=n) for n in (2, 3))
+    assert "guided_vpls" not in short.counts and long.counts["guided_vpls"] == 1
     without_pilot(monkeypatch)
-    assert np.array_equal(guided.radiance(), film_of(cornell_box(), iterations=2, width=64, height=64).radiance())
+    plain = [film_of(wide.rooms(), iterations=n).radiance() for n in (2, 3)]
+    assert np.array_equal(short.radiance(), plain[0]) and not np.array_equal(long.radiance(), plain[1])
 
 
 def test_the_same_bits(wide, tmp_path):

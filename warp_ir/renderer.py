@@ -30,7 +30,6 @@ import warp_ir.estimators.vpl
 import warp_ir.film
 import warp_ir.gather
 import warp_ir.gbuffer
-import warp_ir.pilot.probes
 import warp_ir.reconstruction.blur
 import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
@@ -301,7 +300,6 @@ def _modules(estimator: str, launcher: Launcher) -> list[Any]:
             warp_ir.gbuffer,
             warp_ir.estimators.vpl,
             warp_ir.vpl,
-            warp_ir.pilot.probes,
             warp_ir.reconstruction.compose,
             *common,
             warp_ir.gather,

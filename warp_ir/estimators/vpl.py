@@ -16,14 +16,15 @@ from typing import Any
 
 import warp as wp
 
+import warp_ir.pilot.probes
 from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gather import Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.guide import Guide
+from warp_ir.guide import Guide, unguided
 from warp_ir.launch import Launcher
 from warp_ir.lights import cut_share, lights_beyond, surface_beyond
-from warp_ir.pilot import learn
+from warp_ir.pilot import can_pay, learn
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.vpl import emit_vpls
@@ -34,6 +35,8 @@ _SHADOW_RAYS = (4, 4)
 """Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
 _SHADOW_RAYS_AFTER = (2, 2)
 """Where a compensation ray ends: such light has lost most of its weight."""
+_UNGUIDED = 4
+"""Iterations before those whose light paths are guided: for a picture of fewer, a pilot would take too long."""
 _ROULETTE_DEPTH = wp.constant(2)
 _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the light paths
 
@@ -159,7 +162,11 @@ class VplGatherer:
     def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
         """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
         self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
-        self._guide: Guide | None = None
+        self._unguided = unguided(scene, launcher)
+        self._guide: Guide | None = self._unguided
+        if can_pay(scene):
+            launcher.load([warp_ir.pilot.probes])
+            self._guide = None  # to be learned
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
@@ -169,10 +176,7 @@ class VplGatherer:
         def look() -> None:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
 
-        if self._guide is None:
-            with launcher.phase("pilot"):
-                self._guide = learn(self._scene, self._camera, launcher, settings)
-        guide = self._guide
+        guide = self._guide_of(iteration)
         with launcher.beside("primary", look), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
@@ -195,3 +199,12 @@ class VplGatherer:
                 gbuffer.mesh.shape[0],
                 [guide.scene.data, gbuffer, lights, surfaces, how, direct, indirect],
             )
+
+    def _guide_of(self, iteration: int) -> Guide:
+        """Where the light paths of an iteration go."""
+        if iteration < _UNGUIDED:
+            return self._unguided
+        if self._guide is None:
+            with self._launcher.phase("pilot"):
+                self._guide = learn(self._scene, self._camera, self._launcher, self._settings)
+        return self._guide

@@ -16,6 +16,8 @@ some iterations of a picture, or a part of it, learns the same.
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from warp_ir.device_scene import DeviceScene
 from warp_ir.guide import Guide, unguided
 from warp_ir.launch import Launcher
@@ -23,13 +25,32 @@ from warp_ir.pilot.emitters import choose_emitters
 from warp_ir.pilot.probes import connect, look
 from warp_ir.pilot.rings import aim_at_foci
 from warp_ir.pilot.worth import judge
+from warp_ir.scene import LightKind
 from warp_ir.settings import RenderSettings
 
+_APART = 0.25
+"""Of the scene's diagonal: lights that are closer together than that are seen together, or not at all."""
 _FEWEST, _MOST = 1024, 2048
 """Camera paths; one for every sixteen pixels within these limits, so that they take a small part of an iteration."""
 _MOST_PATHS = 16
 _PIXELS_PER_PATH = 2
 """Of the image at least, for every light path that is started: so the paths remain cheap next to the gathering."""
+
+
+def can_pay(scene: DeviceScene) -> bool:
+    """Whether there is anything to learn: light from far away, or from places far apart."""
+    lights, materials = scene.stored.lights, scene.stored.materials
+    if any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in lights):
+        return True
+    places = [light.world_from_light[:3, 3] for light in lights]
+    emits = np.array([max(material.emission) > 0.0 for material in materials], bool)
+    for mesh in scene.stored.meshes:
+        glowing = mesh.triangles[emits[mesh.material]]
+        if len(glowing):
+            points = mesh.points[glowing.reshape(-1)]
+            places += [points.min(axis=0), points.max(axis=0)]
+    lower, upper = np.reshape(scene.bounds, (2, 3))
+    return len(places) > 1 and bool(np.linalg.norm(np.ptp(places, axis=0)) > _APART * np.linalg.norm(upper - lower))
 
 
 def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderSettings) -> Guide:
