@@ -163,6 +163,30 @@ def Cube "C" {{
     assert warned(scene, "no camera", "-Z" if axis == "Y" else "+Y")
 
 
+@pytest.mark.parametrize(("axis", "up"), [("Y", (0, 1, 0)), ("Z", (0, 0, 1))])
+def test_an_eye_stands_in_place_of_a_camera(tmp_path, axis, up):
+    """It stands where it is told, upright, and looks where it is told, or at the middle of the scene."""
+    text = f"""(upAxis = "{axis}")
+def Camera "C" {{}}
+def Cube "B" {{
+    double3 xformOp:translate = (10, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}"""
+    for target, look_at in (((10, 0, 0), None), ((1, 7, 9), (1, 7, 9))):
+        scene = load(tmp_path, text, eye=(1, 2, 3), look_at=look_at)
+        matrix, forward = scene.camera.world_from_camera, np.array(target) - (1, 2, 3)
+        assert matrix[:3, 3] == pytest.approx((1, 2, 3)) and not warned(scene, "no camera")
+        assert -matrix[:3, 2] == pytest.approx(forward / np.linalg.norm(forward))
+        assert matrix[:3, 0] @ up == pytest.approx(0.0) and matrix[:3, 1] @ up > 0.0
+
+
+@pytest.mark.parametrize("wrong", [{"camera": "C", "eye": (1, 2, 3)}, {"look_at": (0, 0, 0)}])
+def test_an_eye_alone_is_a_camera(tmp_path, wrong):
+    """Either a camera of the stage or an eye; what is to be looked at belongs to the latter."""
+    with pytest.raises(InputError, match="eye: it stands in place of a camera"):
+        load(tmp_path, 'def Camera "C" {}', **wrong)
+
+
 @pytest.mark.parametrize(("axis", "size"), [("Y", (1, 4, 2)), ("Z", (1, 2, 4)), ("Y", (4, 1, 2)), ("Y", (1, 1.6, 1))])
 def test_all_of_the_scene_is_framed(tmp_path, axis, size):
     """Every corner of a box lies in the window, and a tall box fills its height."""

@@ -287,6 +287,9 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     hidden = argparse.SUPPRESS  # usdrecord's names, understood and not advertised
     group = parser.add_argument_group("stage")
     group.add_argument("--camera", "-cam", metavar="NAME", help="path or name (default: the main camera)")
+    point: dict[str, Any] = {"nargs": 3, "type": _finite, "metavar": ("X", "Y", "Z")}
+    group.add_argument("--eye", **point, help="stand here, in place of a camera of the stage")
+    group.add_argument("--look-at", **point, help="with --eye: look there (default: the middle of the scene)")
     when = group.add_mutually_exclusive_group()
     if frames:
         spec = "101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"

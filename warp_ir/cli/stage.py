@@ -18,6 +18,8 @@ def open_reader(args: argparse.Namespace) -> Any:
     return StageReader(
         args.stage,
         camera=args.camera,
+        eye=args.eye,
+        look_at=args.look_at,
         purposes=None if args.purposes is None else tuple(dict.fromkeys(("default", *args.purposes))),
         complexity=args.complexity,
         default_light=args.default_light,

@@ -1,6 +1,8 @@
 """Cameras: which one is meant, what it sees, and one that frames the scene where there is none."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils
@@ -144,6 +146,17 @@ def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
         matrix[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     matrix[:3, 3] = 0.5 * (lower + upper) + distance * matrix[:3, 2]
     return Camera("framing camera", matrix, (-half_x, half_x, -half_y, half_y))
+
+
+def standing_camera(eye: Sequence[float], target: Sequence[float], up_axis: str) -> Camera:
+    """A camera with USD's default lens at one point that looks at another, upright.
+
+    Raises:
+        InputError: The points coincide, or lie above each other.
+    """
+    lens = framing_camera(np.zeros(3), np.ones(3), up_axis)
+    up = (0.0, 1.0, 0.0) if up_axis == "Y" else (0.0, 0.0, 1.0)
+    return replace(lens, name="eye", world_from_camera=Camera.look_at(eye, target, up).world_from_camera)
 
 
 def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:

@@ -12,7 +12,7 @@ from pxr import Tf, Usd, UsdLux
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.black import explain_blackness, explain_dark_lights
-from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter
+from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter, standing_camera
 from warp_ir.usd.gprim import Geometry, build_meshes
 from warp_ir.usd.images import Images
 from warp_ir.usd.light import LIGHTS, read_light
@@ -95,6 +95,8 @@ class StageReader:
         path: str | os.PathLike[str],
         *,
         camera: str | None = None,
+        eye: Sequence[float] | None = None,
+        look_at: Sequence[float] | None = None,
         purposes: Sequence[str] | None = None,
         complexity: str = "low",
         default_light: str = "dome",
@@ -114,6 +116,8 @@ class StageReader:
             path: A .usd, .usda, .usdc or .usdz file.
             camera: Absolute path or name of the camera; None: the one the render settings name, else "main_cam",
                 else the first, else one that frames the scene.
+            eye: Where to stand [3], in place of a camera of the stage, with USD's default lens.
+            look_at: What to look at from there [3]; None: the middle of the scene.
             purposes: Which of default, render, proxy and guide to draw; None: those of the render settings, else
                 default and render.
             complexity: How finely subdivision surfaces are drawn: "low" as their cages, "medium", "high" and "veryhigh"
@@ -148,7 +152,10 @@ class StageReader:
             raise InputError(f"texture_wrap: '{texture_wrap}' is not one of black, clamp, repeat, mirror")
         if render_settings is not None and render_pass is not None:
             raise InputError("render_pass: a pass has its own render settings; give one of the two")
+        if (eye is not None and camera is not None) or (look_at is not None and eye is None):
+            raise InputError("eye: it stands in place of a camera, and look_at belongs to it")
         self._camera, self._purposes, self._default_light = camera, purposes, default_light
+        self._eye, self._look_at = eye, look_at
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _LEVELS[complexity]
         self._opened = Report(self.source, strict=strict)
@@ -198,7 +205,7 @@ class StageReader:
             report.include(self._opened)
             spec = read_render_spec(self.stage, self._render_settings, code, report)
             wanted = product or spec.products[0]
-            chosen = find_camera(self.stage, self._camera, wanted.camera, report)
+            chosen = None if self._eye else find_camera(self.stage, self._camera, wanted.camera, report)
             scene = replace(self._scene(code, chosen, spec, report), settings=dict(wanted.settings))
             slices: tuple[Scene, ...] = ()
             blurs = self._motion_blur and wanted.settings.get("motion_blur", True) and not code.IsDefault()
@@ -281,7 +288,10 @@ class StageReader:
         lights, meshes = link(self.stage, lights, meshes, report)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         stats["triangles"], stats["triangles_seen"] = scene.triangle_count, scene.triangles_seen
-        if view is None:
+        if self._eye:
+            middle = np.mean(scene.bounds(), axis=0).tolist()
+            view = standing_camera(self._eye, self._look_at or middle, self._axis)
+        elif view is None:
             if meshes:
                 along = "-Z" if self._axis == "Y" else "+Y"
                 report.warn("/", f"no camera; one that looks along {along} frames the scene from outside")
