@@ -11,12 +11,12 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.film import FilmData, emission_of
+from warp_ir.film import FilmData
 from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, project, see
 from warp_ir.launch import Launcher
-from warp_ir.reconstruction.compose import Picture, edge_rays, give_back
-from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, on_edge
-from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
+from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
+from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
+from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
 from warp_ir.reconstruction.moments import Blur, at_middle
 from warp_ir.reconstruction.observations import Observations
 from warp_ir.reconstruction.surfaces import MATCH, same_surface
@@ -160,11 +160,7 @@ def _look_through(
         if out.rays <= rays[0]:
             out.own_direct = out.direct / float(out.rays)
             out.own_indirect = out.indirect / float(out.rays)
-    out.emission = out.emission / float(out.rays)
-    out.direct = out.direct / float(out.rays)
-    out.indirect = out.indirect / float(out.rays)
-    out.own_noise = out.own_noise / float(out.rays)
-    mean.pixel = out
+    mean.pixel = mean_of_rays(out)
     return mean
 
 
@@ -174,45 +170,16 @@ def _compose(
 ) -> None:
     """Radiance of a pixel: that of its surface, or that of all it shows, and how far the film's mean is off that."""
     p = first + wp.tid()
-    n = float(out.iterations)
-    emitted = emission_of(film, p)
-    raw_direct = film.direct[p]
-    raw_indirect = film.indirect[p]
-    albedo = film.albedo[p] / n
-    normal = film.normal[p] / n
-    plain = emitted + raw_direct + raw_indirect
+    shown = as_sampled(film, p, out.iterations)
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    other = _others(seen, p, raw_direct / exposure, raw_indirect / exposure, albedo)
+    other = _others(seen, p, shown.direct / exposure, shown.indirect / exposure, shown.albedo)
     edge = on_edge(seen.surfaces, film, p)
     mean = _look_through(blur, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays), edge)
-    pixel = mean.pixel
     if mean.blurred == 1 or edge or layer.direct[p][3] < 0.0:
-        if pixel.rays > out.iterations:
-            albedo = pixel.albedo / float(pixel.rays)
-            normal = pixel.normal / float(pixel.rays)
-            plain += pixel.direct - pixel.own_direct + pixel.indirect - pixel.own_indirect
-            plain += pixel.emission - emitted
-            emitted = pixel.emission
-        direct = pixel.direct
-        indirect = pixel.indirect
-        if film.hits[p] > 0:
-            more = raw_direct - pixel.own_direct
-            out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], pixel.own_noise[0] / n)
-            more = raw_indirect - pixel.own_indirect
-            out.rest.indirect[p] = wp.vec4(more[0], more[1], more[2], pixel.own_noise[1] / n)
+        shown = by_rays(shown, film, mean.pixel, p, 1.0, out)
     else:
-        direct = wp.cw_mul(albedo, value(layer.direct[p])) * exposure
-        indirect = wp.cw_mul(albedo, value(layer.indirect[p])) * exposure
-        reflected = mean_channel(albedo) * exposure
-        noise = seen.noise[p] * (reflected * reflected / n)
-        direct += give_back(raw_direct - direct, noise[0], n)
-        indirect += give_back(raw_indirect - indirect, noise[1], n)
-    if out.rows.shape[0] > 2:
-        out.rows[2, p] = albedo
-        out.rows[3, p] = normal
-        out.rows[4, p] = plain
-    out.rows[0, p] = direct + emitted
-    out.rows[1, p] = indirect
+        shown = on_surface(shown, seen, layer, p, exposure, float(out.iterations))
+    show(out, p, shown)
 
 
 def blur_rays(iterations: int) -> int:

@@ -7,7 +7,7 @@ import warp as wp
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film import FilmData, emission_of
 from warp_ir.launch import Launcher
-from warp_ir.reconstruction.edges import Lit, look_closely, on_edge
+from warp_ir.reconstruction.edges import Lit, Pixel, look_closely, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
 from warp_ir.reconstruction.observations import Observations
 from warp_ir.reconstruction.surfaces import Surfaces
@@ -43,6 +43,77 @@ def give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
     return difference / (1.0 + ratio * ratio)
 
 
+@wp.struct
+class Shown:
+    """A pixel: radiance by what emits, by way of lights and of surfaces, features, and the plain mean."""
+
+    emitted: wp.vec3
+    direct: wp.vec3
+    indirect: wp.vec3
+    albedo: wp.vec3
+    normal: wp.vec3
+    plain: wp.vec3
+
+
+@wp.func
+def as_sampled(film: FilmData, p: int, iterations: int) -> Shown:
+    """The film's own means."""
+    x = Shown()
+    x.emitted = emission_of(film, p)
+    x.direct = film.direct[p]
+    x.indirect = film.indirect[p]
+    x.albedo = film.albedo[p] / float(iterations)
+    x.normal = film.normal[p] / float(iterations)
+    x.plain = x.emitted + x.direct + x.indirect
+    return x
+
+
+@wp.func
+def on_surface(sampled: Shown, seen: Observations, layer: Layer, p: int, exposure: float, n: float) -> Shown:
+    """The filtered light of a pixel that shows one surface, unless the film's mean contradicts it."""
+    x = sampled
+    reflected = mean_channel(x.albedo) * exposure
+    noise = seen.noise[p] * (reflected * reflected / n)
+    x.direct = wp.cw_mul(x.albedo, value(layer.direct[p])) * exposure
+    x.indirect = wp.cw_mul(x.albedo, value(layer.indirect[p])) * exposure
+    x.direct += give_back(sampled.direct - x.direct, noise[0], n)
+    x.indirect += give_back(sampled.indirect - x.indirect, noise[1], n)
+    return x
+
+
+@wp.func
+def by_rays(sampled: Shown, film: FilmData, pixel: Pixel, p: int, exposure: float, out: Picture) -> Shown:
+    """What many rays found, times `exposure`; notes how far the plain mean of the film's own is off."""
+    x = sampled
+    if pixel.rays > out.iterations:
+        x.albedo = pixel.albedo / float(pixel.rays)
+        x.normal = pixel.normal / float(pixel.rays)
+        # The mean as it were of as many rays: less what the film's own saw, and more what all see.
+        x.plain += (pixel.direct - pixel.own_direct + pixel.indirect - pixel.own_indirect) * exposure
+        x.plain += pixel.emission * exposure - x.emitted
+        x.emitted = pixel.emission * exposure
+    x.direct = pixel.direct * exposure
+    x.indirect = pixel.indirect * exposure
+    if film.hits[p] > 0:
+        noise = pixel.own_noise * (exposure * exposure / float(out.iterations))
+        more = sampled.direct - pixel.own_direct * exposure
+        out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])
+        more = sampled.indirect - pixel.own_indirect * exposure
+        out.rest.indirect[p] = wp.vec4(more[0], more[1], more[2], noise[1])
+    return x
+
+
+@wp.func
+def show(out: Picture, p: int, x: Shown) -> None:
+    """Fills a pixel's rows."""
+    if out.rows.shape[0] > 2:
+        out.rows[2, p] = x.albedo
+        out.rows[3, p] = x.normal
+        out.rows[4, p] = x.plain
+    out.rows[0, p] = x.direct + x.emitted
+    out.rows[1, p] = x.indirect
+
+
 @wp.kernel(module="warp_ir.gbuffer")  # so that camera rays are compiled once
 def _compose(
     first: int,
@@ -57,16 +128,9 @@ def _compose(
     """Radiance of a pixel from irradiance on surfaces; on edges, how far the plain mean of the same rays is off."""
     p = first + wp.tid()
     surfaces = seen.surfaces
-    n = float(out.iterations)
-    emitted = emission_of(film, p)
-    raw_direct = film.direct[p]
-    raw_indirect = film.indirect[p]
-    albedo = film.albedo[p] / n
-    normal = film.normal[p] / n
-    plain = emitted + raw_direct + raw_indirect
+    sampled = as_sampled(film, p, out.iterations)
+    shown = sampled
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    direct = raw_direct
-    indirect = raw_indirect
     if seen.count[p] != out.iterations or on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
         other = Lit()
@@ -75,39 +139,15 @@ def _compose(
         other.indirect = seen.other_indirect[p]
         if seen.other_count[p] == 0:
             other.weight = exposure
-            other.direct = wp.cw_div(raw_direct, wp.max(albedo, wp.vec3(1.0e-6)))
-            other.indirect = wp.cw_div(raw_indirect, wp.max(albedo, wp.vec3(1.0e-6)))
+            other.direct = wp.cw_div(sampled.direct, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
+            other.indirect = wp.cw_div(sampled.indirect, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
         means = mean_channels(other.direct, other.indirect)
         other.noise = wp.cw_mul(means, means) / other.weight
         pixel = look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
-        if pixel.rays > out.iterations:
-            albedo = pixel.albedo / float(pixel.rays)
-            normal = pixel.normal / float(pixel.rays)
-            # The mean as it were of as many rays: less what the film's own saw, and more what all see.
-            plain += (pixel.direct - pixel.own_direct + pixel.indirect - pixel.own_indirect) * exposure
-            plain += pixel.emission * exposure - emitted
-            emitted = pixel.emission * exposure
-        direct = pixel.direct * exposure
-        indirect = pixel.indirect * exposure
-        if film.hits[p] > 0:
-            more = raw_direct - pixel.own_direct * exposure
-            noise = pixel.own_noise * (exposure * exposure / n)
-            out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])
-            more = raw_indirect - pixel.own_indirect * exposure
-            out.rest.indirect[p] = wp.vec4(more[0], more[1], more[2], noise[1])
+        shown = by_rays(sampled, film, pixel, p, exposure, out)
     elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
-        direct = wp.cw_mul(albedo, value(layer.direct[p])) * exposure
-        indirect = wp.cw_mul(albedo, value(layer.indirect[p])) * exposure
-        reflected = mean_channel(albedo) * exposure
-        noise = seen.noise[p] * (reflected * reflected / n)
-        direct += give_back(raw_direct - direct, noise[0], n)
-        indirect += give_back(raw_indirect - indirect, noise[1], n)
-    if out.rows.shape[0] > 2:
-        out.rows[2, p] = albedo
-        out.rows[3, p] = normal
-        out.rows[4, p] = plain
-    out.rows[0, p] = direct + emitted
-    out.rows[1, p] = indirect
+        shown = on_surface(sampled, seen, layer, p, exposure, float(out.iterations))
+    show(out, p, shown)
 
 
 @wp.kernel

@@ -94,6 +94,17 @@ class Pixel:
 
 
 @wp.func
+def mean_of_rays(sums: Pixel) -> Pixel:
+    """Light and noise per ray; albedo and normals stay sums."""
+    out = sums
+    out.emission = sums.emission / float(sums.rays)
+    out.direct = sums.direct / float(sums.rays)
+    out.indirect = sums.indirect / float(sums.rays)
+    out.own_noise = sums.own_noise / float(sums.rays)
+    return out
+
+
+@wp.func
 def look_closely(
     scene: SceneData, camera: CameraData, seen: Observations, layer: Layer, p: int, other: Lit, rays: wp.vec2i
 ) -> Pixel:
@@ -133,8 +144,4 @@ def look_closely(
         if out.rays <= rays[0]:
             out.own_direct = out.direct / float(out.rays)
             out.own_indirect = out.indirect / float(out.rays)
-    out.emission = out.emission / float(out.rays)
-    out.direct = out.direct / float(out.rays)
-    out.indirect = out.indirect / float(out.rays)
-    out.own_noise = out.own_noise / float(out.rays)
-    return out
+    return mean_of_rays(out)
