@@ -429,6 +429,16 @@ def test_materials_read_primvars_of_instances(tmp_path, kind, primvar, albedo):
         assert not warned(scene, "/P")
 
 
+def test_emission_by_primvars_of_instances_is_named(tmp_path):
+    """Emission that each instance should have of its own is that of the fallback, and said; not where none is given."""
+    glow = reader("Look").replace("diffuseColor", "emissiveColor") + BOUND.format("C", "Look", "")
+    for primvar, said in ((TINTS, True), ("", False)):
+        text = glow + f'\ndef PointInstancer "P" {{\n rel prototypes = </C>\n {TWO}\n {primvar}\n}}'
+        scene = load(tmp_path, text)
+        assert bool(warned(scene, "/C", "primvar tint of each instance is not read")) == said
+        assert max(material.emission for material in scene.materials) == (0.5, 0.5, 0.5)
+
+
 def test_a_color_of_the_whole_instancer_reaches_prototypes_elsewhere(tmp_path):
     """A constant displayColor of an instancer colours prototypes that do not inherit it, but not these themselves."""
     color = "color3f[] primvars:displayColor = [(1, 0, 0)]"

@@ -186,6 +186,10 @@ class _Builder:
 
     def _with_instance_primvars(self, site: Site, look: Look) -> tuple[Site, Look]:
         """The gprim as its material has it, if that reads primvars which instancers give to each instance."""
+        given = [level.primvars for level in site.level.chain() if level.primvars is not None]
+        for name in sorted(name for name in look.unread if any(each.has(name) for each in given)):
+            what = f"emission or opacity by the primvar {name} of each instance is not read: its fallback counts"
+            self._report.warn(site.prim.GetPath(), what)
         levels = [self._paint(site.level, albedo) for _, albedo in look.asked]
         found = [k for k, level in enumerate(levels) if any(each.colors is not None for each in level.chain())]
         if not found:

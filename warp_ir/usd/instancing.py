@@ -79,6 +79,10 @@ class InstancePrimvars:
     """Which of them are meant, int [k]."""
     time: Usd.TimeCode
 
+    def has(self, name: str) -> bool:
+        """Whether the instancer has a primvar."""
+        return bool(UsdGeom.PrimvarsAPI(self.prim).GetPrimvar(name).HasValue())
+
     def read(self, name: str, channels: int, report: Report) -> Floats | None:
         """A value for each of the k instances that are meant, float64 [k, c]; None if there are none.
 

@@ -39,13 +39,17 @@ class Look:
     """float32 [m, 3, 2], the texture coordinates that the materials need, by name."""
     asked: tuple[tuple[Mask, Signal], ...] = ()
     """bool [m], triangles whose albedo depends on primvars that the prim lacks, and an instancer may have; and how."""
+    unread: frozenset[str] = frozenset()
+    """Such primvars that emission or opacity depend on: of instancers they are not read."""
 
     def keep(self, mask: Mask) -> "Look":
         """The look of the triangles that a mask [m] selects."""
         colors = None if self.colors is None else self.colors[mask]
         uvs = {name: corners[mask] for name, corners in self.uvs.items()}
         asked = tuple((which[mask], albedo) for which, albedo in self.asked)
-        return Look(self.material[mask], colors, None if self.bare is None else self.bare[mask], uvs, asked)
+        return Look(
+            self.material[mask], colors, None if self.bare is None else self.bare[mask], uvs, asked, self.unread
+        )
 
 
 class MaterialTable:
@@ -113,6 +117,14 @@ class MaterialTable:
             return Look(index)
         colors: Floats | None = None
         lacking: list[tuple[Mask, Signal]] = []
+        unread = frozenset(
+            wanted.name
+            for surface in asked.values()
+            for signal in (surface.emission, surface.opacity)
+            if signal is not None
+            for wanted in signal.primvars
+            if not UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(wanted.name)
+        )
         for k, surface in asked.items():
             chosen = index == k
             material = self.materials[k]
@@ -129,8 +141,8 @@ class MaterialTable:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
         if not bare.any():
-            return Look(index, colors, asked=tuple(lacking))
-        look = replace(self._bare(prim, shape, index, bare), asked=tuple(lacking))
+            return Look(index, colors, asked=tuple(lacking), unread=unread)
+        look = replace(self._bare(prim, shape, index, bare), asked=tuple(lacking), unread=unread)
         if colors is None:
             return look
         chosen = bare if look.colors is not None else np.zeros_like(bare)
