@@ -288,6 +288,15 @@ def carve(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
     return arrays
 
 
+def copied(record: Any) -> Any:
+    """Another `wp.struct` of the same kind and the same arrays."""
+    kind = record._cls
+    copy = kind()
+    for name in kind.vars:
+        setattr(copy, name, getattr(record, name))
+    return copy
+
+
 def floats(*dtypes: Any) -> int:
     """How many float32 a row of these types takes."""
     return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes) // 4

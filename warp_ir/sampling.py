@@ -143,6 +143,12 @@ def _seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
     return hash_combine(hash_combine(scramble, stream), scramble)
 
 
+@wp.func
+def to_unit(bits: wp.uint32) -> float:
+    """Random bits as a number in [0, 1)."""
+    return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
+
+
 @wp.func(inline=False)  # kernels ask for a dozen
 def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> float:
     """Coordinate `dimension` of point `index` of the sequence `scramble`, in [0, 1)."""
@@ -161,7 +167,7 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
         i = i >> wp.uint32(1)
         column += 1
     x = _reverse_bits(_permute_reversed(x, _seed(scramble, wp.uint32(dimension))))
-    return float(x >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
+    return to_unit(x)
 
 
 @wp.func

@@ -78,7 +78,7 @@ class PathSettings:
 def _coin(scramble: wp.uint32, path: int, bounce: int) -> float:
     """Uniform in [0, 1), for every VPL."""
     bits = sampling.hash_combine(sampling.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
-    return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
+    return sampling.to_unit(bits)
 
 
 @wp.func(inline=False)

@@ -68,8 +68,8 @@ def light(kind, more="", matrix=IDENTITY, api="", name="L"):
     return f'\ndef {kind} "{name}" {schemas} {{\n    {at(matrix)}    {more}\n}}\n'
 
 
-def material(inputs, name="Look"):
-    """A UsdPreviewSurface."""
+def material(inputs, name="Look", nodes=""):
+    """A UsdPreviewSurface, and the nodes that feed it."""
     return f"""
 def Material "{name}" {{
     token outputs:surface.connect = </{name}/S.outputs:surface>
@@ -78,8 +78,25 @@ def Material "{name}" {{
         {inputs}
         token outputs:surface
     }}
+    {nodes}
 }}
 """
+
+
+def image_nodes(file, more="", output="rgb", name="Look", place="R"):
+    """The nodes of a material's image: T, which is placed by the result of a node, R being primvars:st."""
+    return f"""def Shader "T" {{
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @{file}@
+        float2 inputs:st.connect = </{name}/{place}.outputs:result>
+        {more}
+        float3 outputs:{output}
+    }}
+    def Shader "R" {{
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }}"""
 
 
 def load(folder, text, *, warnings=(), **options):

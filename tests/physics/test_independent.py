@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.level import at, load, mesh, placed, rotation, usd, write_image
+from tests.physics.level import at, image_nodes, load, material, mesh, placed, rotation, usd, write_image
 
 pytestmark = pytest.mark.slow
 
@@ -144,35 +144,6 @@ def room_mi(mi):
 
 def moved(matrix, points):
     return np.asarray(points) @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
-
-
-def material(name, inputs, nodes=""):
-    return f"""
-def Material "{name}" {{
-    token outputs:surface.connect = </{name}/S.outputs:surface>
-    def Shader "S" {{
-        uniform token info:id = "UsdPreviewSurface"
-        {inputs}
-        token outputs:surface
-    }}
-    {nodes}
-}}
-"""
-
-
-def image_nodes(name, file, more, output="rgb"):
-    return f"""def Shader "T" {{
-        uniform token info:id = "UsdUVTexture"
-        asset inputs:file = @{file}@
-        float2 inputs:st.connect = </{name}/R.outputs:result>
-        {more}
-        float3 outputs:{output}
-    }}
-    def Shader "R" {{
-        uniform token info:id = "UsdPrimvarReader_float2"
-        string inputs:varname = "st"
-        float2 outputs:result
-    }}"""
 
 
 def test_lights(mi, tmp_path):
@@ -312,8 +283,8 @@ def DomeLight "Sky" {{
     holed = """float inputs:opacityThreshold = 0.5
         color3f inputs:diffuseColor = (0.6, 0.2, 0.2)
         float inputs:opacity.connect = </Holes/T.outputs:r>"""
-    text += material("Holes", holed, image_nodes("Holes", "holes.png", clamp, "r"))
-    text += material("Half", "color3f inputs:diffuseColor = (0.2, 0.3, 0.9)\n float inputs:opacity = 0.5")
+    text += material(holed, "Holes", image_nodes("holes.png", clamp, "r", "Holes"))
+    text += material("color3f inputs:diffuseColor = (0.2, 0.3, 0.9)\n float inputs:opacity = 0.5", "Half")
 
     image = {"type": "bitmap", "filename": str(tmp_path / "holes.png"), "raw": True, "wrap_mode": "clamp",
              "filter_type": "nearest"}  # fmt: skip
@@ -374,10 +345,10 @@ def RectLight "Lamp" {{
     for name, file, more in (("Turned", "t.png", repeat), ("Mirror", "t.png", mirror), ("Tiles", "u.<UDIM>.png", "")):
         if name == "Mirror":
             more += "\n float4 inputs:scale = (0.5, 0.9, 0.7, 1)\n float4 inputs:bias = (0.1, 0, 0.2, 0)"
-        nodes = image_nodes(name, file, more)
+        nodes = image_nodes(file, more, name=name)
         if name == "Turned":
             nodes = nodes.replace("</Turned/R.", "</Turned/P.") + "\n    " + turned
-        text += material(name, f"color3f inputs:diffuseColor.connect = </{name}/T.outputs:rgb>", nodes)
+        text += material(f"color3f inputs:diffuseColor.connect = </{name}/T.outputs:rgb>", name, nodes)
     colors = random.random((8, 3)).round(3)
     metal = placed(rotation(1, 30.0) @ np.diag([0.7, 1.1, 0.7]), (-0.6, 0.55, -0.4))
     plastic = placed(np.diag([0.5, 0.5, 0.5]), (0.6, 0.25, 0.9))
@@ -388,9 +359,9 @@ def RectLight "Lamp" {{
         text += mesh(name + "Box", CUBE, SIDES, f"{at(matrix)} rel material:binding = </{name}>", api)
     painting = f'color3f[] primvars:displayColor = {usd(colors)} (interpolation = "vertex")'
     text += mesh("Painted", CUBE, triangles, f"{at(painted)} {painting}")
-    text += material("Metal", "color3f inputs:diffuseColor = (0.9, 0.7, 0.3)\n float inputs:metallic = 1")
+    text += material("color3f inputs:diffuseColor = (0.9, 0.7, 0.3)\n float inputs:metallic = 1", "Metal")
     specular = "color3f inputs:diffuseColor = (0.2, 0.5, 0.6)\n int inputs:useSpecularWorkflow = 1\n"
-    text += material("Plastic", specular + "color3f inputs:specularColor = (0.2, 0.2, 0.2)")
+    text += material(specular + "color3f inputs:specularColor = (0.2, 0.2, 0.2)", "Plastic")
 
     def bitmap(file, wrap):
         return {"type": "bitmap", "filename": str(tmp_path / file), "wrap_mode": wrap}

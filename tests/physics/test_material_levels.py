@@ -14,6 +14,7 @@ from tests.physics.level import (
     assert_level,
     bilinear,
     floor,
+    image_nodes,
     irradiance,
     level,
     light,
@@ -51,19 +52,7 @@ def texture(more="", output="rgb", target="color3f inputs:diffuseColor", file="t
     """A material whose input is an image."""
     return look(
         f"{target}.connect = </Look/T.outputs:{output}>\n        {rest}",
-        f"""def Shader "T" {{
-        uniform token info:id = "UsdUVTexture"
-        asset inputs:file = @{file}@
-        float2 inputs:st.connect = </Look/{place}.outputs:result>
-        {more}
-        float3 outputs:{output}
-    }}
-    def Shader "R" {{
-        uniform token info:id = "UsdPrimvarReader_float2"
-        string inputs:varname = "st"
-        float2 outputs:result
-    }}
-    {nodes}""",
+        f"{image_nodes(file, more, output, place=place)}\n    {nodes}",
     )
 
 

@@ -11,7 +11,7 @@ from warp_ir.bvh.build import build_tree, concatenated, tree_address, tree_size
 from warp_ir.bvh.layout import Bvh, MeshTree, vec8, vec8i
 from warp_ir.bvh.refit import box_of, refit_tree, warp_cost, wide_cost
 from warp_ir.bvh.top import build_top
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, copied
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,9 +140,7 @@ class Trees:
                 row += getattr(top, name).shape[0]
 
     def _world(self, world: Sequence[int], root: int) -> Any:
-        out = Bvh()
-        for name in Bvh.vars:
-            setattr(out, name, getattr(self._bvh, name))
+        out = copied(self._bvh)
         out.root, out.world_count = root, len(world)
         if self._launcher.device.is_cuda:
             out.root = len(self._trees)

@@ -17,7 +17,7 @@ from warp_ir.device_scene.records import SceneData
 from warp_ir.device_scene.storage import arranged
 from warp_ir.device_scene.surfaces import Surfaces, same_objects
 from warp_ir.grid import GridList
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, copied
 from warp_ir.scene import InputError, Scene, materials_of
 
 _PATCHES = 2**14
@@ -116,13 +116,11 @@ def _upload(
     lit: list[tuple[Any, Any, GridList, Any]] = []
     grids = [other.grids for other in previous]
     for k, scene in enumerate(scenes):
-        data = SceneData()
         like = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
         if like is not None:
-            for name in SceneData.vars:
-                setattr(data, name, getattr(lit[like][0], name))
-            lit.append((data, *lit[like][1:]))
+            lit.append((copied(lit[like][0]), *lit[like][1:]))
             continue
+        data = SceneData()
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
         # Links name meshes by their numbers in the scene, not by where they are stored.

@@ -44,7 +44,7 @@ def can_pay(scene: DeviceScene) -> bool:
         return True
     places = [light.world_from_light[:3, 3] for light in lights]
     emits = np.array([max(material.emission) > 0.0 for material in materials], bool)
-    for mesh in scene.stored.meshes:
+    for mesh in scene.stored.meshes if emits.any() else ():
         glowing = mesh.triangles[emits[mesh.material]]
         if len(glowing):
             points = mesh.points[glowing.reshape(-1)]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, copied
 from warp_ir.pilot.probes import Sightings
 
 Floats = npt.NDArray[np.float64]
@@ -64,9 +64,7 @@ def _ratio(a: Floats, b: Floats) -> Floats:
 
 def _rechosen(scene: DeviceScene, power: Floats, chosen: Floats, launcher: Launcher) -> DeviceScene:
     """The same scene, its emitters chosen with other probabilities."""
-    data = SceneData()
-    for name in SceneData.vars:
-        setattr(data, name, getattr(scene.data, name))
+    data = copied(scene.data)
     cdf = np.concatenate([[0.0], np.cumsum(chosen)])
     cdf /= cdf[-1]
     data.emitter_cdf = launcher.array(cdf, wp.float32)

@@ -11,7 +11,7 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import camera_ray, see
 from warp_ir.guide import CELLS, Guide, cell_of
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, copied
 from warp_ir.lights import arriving, choose_emitter, sample_arrival
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest, visible
@@ -135,9 +135,7 @@ class Sightings:
 
 def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: RenderSettings) -> Sightings:
     """Sends paths from all over the image."""
-    whole = CameraData()
-    for name in CameraData.vars:
-        setattr(whole, name, getattr(camera, name))
+    whole = copied(camera)
     whole.columns, whole.rows, whole.first_column, whole.first_row = camera.image_columns, camera.image_rows, 0, 0
     n = paths * _VERTICES * _ASKED
     rows = _Rows()

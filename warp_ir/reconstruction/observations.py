@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.launch import Launcher
+from warp_ir.launch import Launcher, copied
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
 from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
 
@@ -194,15 +194,7 @@ def observe(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launc
 
 def average(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
     """Fills a `Layer` with the means of `Observations`, and gives these back with their `noise`, which it fills too."""
-    seen = _copy(Observations, seen)
+    seen = copied(seen)
     seen.noise = noise
     launcher.launch(_average, seen.count.shape[0], [seen.surfaces, seen, layer])
     return seen
-
-
-def _copy(kind: Any, record: Any) -> Any:
-    """Another record of some kind, of the same arrays."""
-    copy = kind()
-    for name in kind.vars:
-        setattr(copy, name, getattr(record, name))
-    return copy
