@@ -177,7 +177,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     uploaded = upload_scene(scene, launcher)
     settings = ir.RenderSettings(width=width, height=width)
     camera = camera_data(scene.camera, uploaded.frame, settings)
-    gbuffer, *_ = new_gbuffer(launcher, width * width, mapped=uploaded.data.normal_map_count > 0, glows=True)
+    gbuffer, *_ = new_gbuffer(launcher, width, width, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
         unguided(uploaded, launcher),
@@ -214,6 +214,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
 
     side = max(1, width // 4)  # brute force is slow: a smaller picture will do
     small = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=side, height=side))
+    gbuffer, *_ = new_gbuffer(launcher, side, side, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, small, launcher, gbuffer, iteration=0, seed=0)
     out = launcher.empty(side * side, wp.vec3)
     gather: dict[str, Any] = {"scene": name, "vpls": vpls.count}

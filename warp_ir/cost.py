@@ -26,7 +26,7 @@ _SHAPED = 8200  # directions of photons
 
 # Bytes of a pixel: twelve are a colour, a place or a direction.
 _COLOR = 12
-_FILM = 88
+_FILM = 92
 _ITERATION = 68  # what the camera sees, and the light there
 _OBSERVED = 92  # by the filter, beside the film
 _LAYERS = 72  # where an iteration lay: two images and their noise

@@ -18,6 +18,7 @@ from warp_ir.denoise import denoise
 from warp_ir.gbuffer import GBuffer
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError
+from warp_ir.tiles import TILE, Tiles, all_tiles, indices, pixel_at, pixel_of_tile, some_tiles, tile_count
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -35,6 +36,7 @@ _SEEN = "seen_"
 class FilmData:
     """Radiance, a mean over iterations, and what else there is, sums; one row per pixel."""
 
+    count: wp.array[wp.int32]  # iterations
     emission: wp.array[wp.vec3]  # empty if there can be none
     direct: wp.array[wp.vec3]  # light reflected once
     indirect: wp.array[wp.vec3]
@@ -79,11 +81,13 @@ def _add(
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
     exposure: float,
-    before: int,
     film: FilmData,
 ) -> None:
-    """Adds one iteration's estimate of every pixel to as many as there were before."""
-    i = first + wp.tid()
+    """Adds one iteration's estimates."""
+    i = pixel_at(gbuffer.tiles, first + wp.tid())
+    if i < 0:
+        return
+    before = film.count[i]
     le = wp.vec3(0.0)
     if film.emission.shape[0] > 0:
         le = gbuffer.emission[i] * exposure
@@ -101,6 +105,7 @@ def _add(
         film.emission[i] += (le - film.emission[i]) * share
     film.direct[i] += (once - film.direct[i]) * share
     film.indirect[i] += (more - film.indirect[i]) * share
+    film.count[i] = before + 1
     if before == 0:
         film.mesh[i] = gbuffer.mesh[i]
     if gbuffer.mesh[i] >= 0:
@@ -111,24 +116,44 @@ def _add(
         film.depth[i] += gbuffer.depth[i]
 
 
+@wp.func
+def _off_neighbors(film: FilmData, tiles: Tiles, tile: int, k: int) -> wp.vec3:
+    """How far a pixel of one sample is off the two beside it on its mesh, were they of its colour."""
+    i = pixel_of_tile(tiles, tile, k)
+    sum = wp.vec3(0.0)
+    count = float(0.0)
+    for direction in range(2):
+        j = pixel_of_tile(tiles, tile, k ^ (1 + 7 * direction))
+        if j >= 0 and film.mesh[j] == film.mesh[i] and wp.min(film.albedo[j]) > 0.0:
+            there = wp.cw_mul(wp.cw_div(film.direct[j] + film.indirect[j], film.albedo[j]), film.albedo[i])
+            sum += there - film.direct[i] - film.indirect[i]
+            count += 1.0
+    return sum / wp.max(count, 1.0)
+
+
 @wp.kernel
-def _measure(
-    first: int, film: FilmData, columns: int, iterations: int, floor: wp.float64, out: wp.array[wp.vec2d]
-) -> None:
-    """Sums over a row of pixels: of the radiance L, and of its se² / (L² + floor)."""
-    row = first + wp.tid()
+def _measure(first: int, film: FilmData, tiles: Tiles, floor: wp.float64, out: wp.array[wp.vec2d]) -> None:
+    """Sums over a tile: of the radiance L, and of its se² / (L² + floor)."""
+    tile = first + wp.tid()
     radiance = wp.float64(0.0)
     error = wp.float64(0.0)
-    for i in range(row * columns, (row + 1) * columns):
-        mean = emission_of(film, i) + film.direct[i] + film.indirect[i]
-        for c in range(3):
-            x = wp.float64(mean[c])
-            s = wp.float64(film.deviation[i][c])
-            scale = x * x + floor
-            radiance += x
-            if scale > wp.float64(0.0):
-                error += s * s / (scale * wp.float64(iterations - 1))
-    out[row] = wp.vec2d(radiance, error)
+    for k in range(64):
+        i = pixel_of_tile(tiles, tile, k)
+        if i >= 0:
+            mean = emission_of(film, i) + film.direct[i] + film.indirect[i]
+            off = film.deviation[i]
+            free = float(film.count[i] - 1)
+            if film.count[i] == 1:  # its neighbours may say something
+                off = _off_neighbors(film, tiles, tile, k)
+                free = 1.5
+            for c in range(3):
+                x = wp.float64(mean[c])
+                s = wp.float64(off[c])
+                scale = x * x + floor
+                radiance += x
+                if scale > wp.float64(0.0):
+                    error += s * s / (scale * wp.float64(free))
+    out[tile] = wp.vec2d(radiance, error)
 
 
 class Film:
@@ -143,7 +168,7 @@ class Film:
         """
         self.width, self.height = width, height
         self.iterations = 0
-        """Iterations added."""
+        """Iterations added; tiles that were done before have fewer (`Film.done`)."""
         self.seconds = 0.0
         """Wall time of rendering them [s], without loading and compiling."""
         self.interrupted = 0
@@ -165,20 +190,34 @@ class Film:
         for name in (*_RADIANCE, "deviation", "albedo", "normal", "position"):
             setattr(data, name, launcher.zeros(pixels if glows or name != "emission" else 0, wp.vec3))
         data.depth = launcher.zeros(pixels, wp.float32)
-        for name in ("hits", "rejected", "mesh"):
+        for name in ("count", "hits", "rejected", "mesh"):
             setattr(data, name, launcher.zeros(pixels, wp.int32))
         self._data = data
+        self._missed: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
+        self.chosen = np.ones(len(self._missed), bool)
+        """Which tiles of 8 x 8 pixels, row by row, the next iteration is for."""
+        self.tiles: Any = all_tiles(width, height, launcher)
+        """The same on the device."""
+
+    def choose(self, tiles: npt.NDArray[np.bool_]) -> None:
+        """From now on iterations are for these tiles alone, bool [tiles]."""
+        self.chosen = tiles
+        self.tiles = some_tiles(tiles, self._missed, self.width, self.height, self._launcher)
+
+    @property
+    def tile_iterations(self) -> npt.NDArray[np.int32]:
+        """How many iterations every tile of 8 x 8 pixels has had, [tiles], row by row."""
+        return self.iterations - self._missed
 
     def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0, moment: int = 0) -> None:
         """Adds one iteration: what the camera saw at some moment, and the irradiance over π estimated for it."""
-        self._launcher.launch(
-            _add,
-            self.width * self.height,
-            [gbuffer, direct, indirect, exposure, self.iterations, self._data],
-        )
+        self._launcher.launch(_add, indices(gbuffer.tiles), [gbuffer, direct, indirect, exposure, self._data])
         if self.reconstruction is not None:
             self.reconstruction.observe(gbuffer, direct, indirect, moment)
         self.iterations += 1
+        if not self.chosen.all():
+            self._missed += ~self.chosen
+            self.choose(self.chosen)
 
     def merge(self, other: "Film") -> None:
         """Adds another film of the same picture; that it used other iterations or another seed is up to you.
@@ -192,23 +231,26 @@ class Film:
             raise InputError("film: cannot merge a film that shows what emits with one that does not")
         if other.iterations == 0:
             return
-        n, m = self.iterations, other.iterations
+        n, m = (film._data.count.numpy().astype(np.float64) for film in (self, other))
+        share = (m / np.maximum(n + m, 1.0))[:, None]  # the other's
         apart = (self._sum(*_RADIANCE) - other._sum(*_RADIANCE)).astype(np.float64).reshape(-1, 3)
         for name in FilmData.vars:
             mine, theirs = (getattr(film._data, name).numpy() for film in (self, other))
             if name in _RADIANCE:
-                mine = np.average([mine, theirs], axis=0, weights=[n, m])
+                mine = mine * (1.0 - share) + theirs * share
             elif name == "deviation":
-                variance = np.average(np.square([mine, theirs], dtype=np.float64), axis=0, weights=[n, m])
-                mine = np.sqrt(variance + n * m * (apart / (n + m)) ** 2)
-            elif name != "mesh":
+                mine, theirs = (x.astype(np.float64) ** 2 for x in (mine, theirs))
+                mine = np.sqrt(mine * (1.0 - share) + theirs * share + share * (1.0 - share) * apart**2)
+            elif name == "mesh":
+                mine = np.where(n > 0, mine, theirs)
+            else:
                 mine = mine + theirs
-            elif n == 0:
-                mine = theirs
             getattr(self._data, name).assign(mine)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self.iterations += other.iterations
+        self._missed += other._missed
+        self.choose(self.chosen)
         self.seconds += other.seconds
 
     def radiance(self) -> npt.NDArray[np.float32]:
@@ -254,10 +296,9 @@ class Film:
         Iterations are independent but for the stratified pixel jitter: on edges the true error is smaller.
         Infinite with fewer than two iterations.
         """
-        n = self.iterations
-        if n < 2:
-            return np.full((self.height, self.width, 3), np.inf, np.float32)
-        return self._sum("deviation") / np.float32(math.sqrt(n - 1))
+        n = self._data.count.numpy().reshape(self.height, self.width, 1)
+        error = self._sum("deviation") / np.sqrt(np.maximum(n - 1, 1), dtype=np.float32)
+        return np.where(n > 1, error, np.float32(np.inf))
 
     def error(self) -> float:
         """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²), m the mean of L.
@@ -266,15 +307,19 @@ class Film:
         """
         if self.iterations < 2:
             return math.nan
+        return math.sqrt(self.squared_errors().sum())
+
+    def squared_errors(self) -> npt.NDArray[np.float64]:
+        """What every tile of 8 x 8 pixels has in the square of `error`, [tiles], row by row."""
         values = 3 * self.width * self.height
-        mean = self._measure(0.0)[0] / values
-        return math.sqrt(self._measure(0.01 * mean**2)[1] / values)
+        mean = self._measure(0.0)[:, 0].sum() / values
+        return np.asarray(self._measure(0.01 * mean**2)[:, 1] / values)
 
     def _measure(self, floor: float) -> Any:
-        """Sums over the picture: of the radiance L, and of its se² / (L² + floor)."""
-        rows = self._launcher.empty(self.height, wp.vec2d)
-        self._launcher.launch(_measure, self.height, [self._data, self.width, self.iterations, floor, rows])
-        return rows.numpy().sum(axis=0)
+        """Sums over each tile: of the radiance L, and of its se² / (L² + floor)."""
+        tiles = self._launcher.empty(tile_count(self.width, self.height), wp.vec2d)
+        self._launcher.launch(_measure, tiles.shape[0], [self._data, self.tiles, floor, tiles])
+        return tiles.numpy()
 
     def aov(self, name: str) -> Image:
         """One of `AOV_NAMES`.
@@ -299,7 +344,8 @@ class Film:
             return self._data.mesh.numpy().reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
         hits = self._data.hits.numpy().reshape(shape)
         if name == "alpha":
-            return (hits / max(self.iterations, 1)).astype(np.float32)
+            count = self._data.count.numpy().reshape(shape)
+            return (hits / np.maximum(count, 1)).astype(np.float32)
         if name not in AOV_NAMES:
             raise InputError(f"aov: there is no {name!r}; there are {', '.join(AOV_NAMES)}")
         total = getattr(self._data, name).numpy().astype(np.float64).reshape(*shape, -1)
@@ -313,6 +359,11 @@ class Film:
         if name == "depth":
             mean = mean[..., 0] / (self._frame.scale if self._frame is not None else 1.0)
         return mean.astype(np.float32)
+
+    @property
+    def skipped(self) -> int:
+        """Samples of pixels that iterations have left out, their tiles being done."""
+        return self.iterations * self.width * self.height - int(self._data.count.numpy().sum(dtype=np.int64))
 
     @property
     def rejected(self) -> int:
@@ -330,9 +381,9 @@ class Film:
         if self.reconstruction is not None:
             arrays |= {_SEEN + name: array.numpy() for name, array in self.reconstruction.arrays().items()}
         origin, scale = (self._frame.origin, self._frame.scale) if self._frame is not None else (np.zeros(3), 1.0)
-        size = np.array([self.width, self.height, self.iterations])
+        arrays |= {"origin": origin, "scale": scale, "chosen": self.chosen, "seconds": self.seconds}
         with open(path, "wb") as file:
-            np.savez(file, key=key, size=size, seconds=self.seconds, origin=origin, scale=scale, **arrays)
+            np.savez(file, key=key, size=np.array([self.width, self.height, self.iterations]), **arrays)
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
         """Goes on where a film was when `save` wrote it: this one, empty and of the same scene, becomes that one.
@@ -343,7 +394,7 @@ class Film:
         wanted = {name: getattr(self._data, name) for name in FilmData.vars}
         if self.reconstruction is not None:
             wanted |= {_SEEN + name: array for name, array in self.reconstruction.arrays().items()}
-        about = _read(path, ["key", "size", "seconds"])
+        about = _read(path, ["key", "size", "seconds", "chosen"])
         if str(about["key"]) != key or about["size"][:2].tolist() != [self.width, self.height]:
             raise InputError(f"{os.fspath(path)}: a film of another scene, or with other settings")
         arrays = _read(path, [*wanted])
@@ -352,6 +403,7 @@ class Film:
         for name, array in wanted.items():
             array.assign(arrays[name])
         self.iterations, self.seconds = int(about["size"][2]), float(about["seconds"])
+        self._take_tiles(about["chosen"])
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
@@ -362,14 +414,21 @@ class Film:
         """
         from warp_ir.device_scene import DeviceFrame
 
-        arrays = _read(path, [*FilmData.vars, "size", "seconds", "origin", "scale"])
+        arrays = _read(path, [*FilmData.vars, "size", "seconds", "chosen", "origin", "scale"])
         width, height, iterations = (int(x) for x in arrays["size"])
         frame = DeviceFrame(arrays["origin"], float(arrays["scale"]))
         film = Film(width, height, Launcher(device), frame, glows=len(arrays["emission"]) > 0)
         film.iterations, film.seconds = iterations, float(arrays["seconds"])
         for name in FilmData.vars:
             getattr(film._data, name).assign(arrays[name])
+        film._take_tiles(arrays["chosen"])
         return film
+
+    def _take_tiles(self, chosen: npt.NDArray[np.bool_]) -> None:
+        """Finds out how many iterations have left out each tile; chooses those of the next."""
+        count = self._data.count.numpy().reshape(self.height, self.width)
+        self._missed = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
+        self.choose(chosen)
 
     def _sum(self, *names: str) -> npt.NDArray[np.float32]:
         """The sum of some tables, float32 [height, width, 3]; never a view of one."""

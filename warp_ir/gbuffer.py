@@ -14,6 +14,7 @@ from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.launch import Launcher, carve, floats
 from warp_ir.lights import lights_found, surface_seen
 from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, smooth_rise
+from warp_ir.tiles import Tiles, all_tiles, indices, missed_at, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -43,6 +44,7 @@ class GBuffer:
     emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection; empty: there can be none
     depth: wp.array[wp.float32]  # along the camera's -Z
     anchor: wp.array[Anchor]  # no rows if no surface moves while the shutter is open
+    tiles: Tiles  # the pixels that are looked through; rows of others are of no meaning
 
 
 @wp.struct
@@ -203,12 +205,16 @@ def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
 ) -> None:
     """One camera ray and what it meets."""
-    pixel = first + wp.tid()
+    index = first + wp.tid()
+    pixel = pixel_at(gbuffer.tiles, index)
+    if pixel < 0:
+        return
     place = wp.vec2(0.5, 0.5)
     lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
-        place = jitter(scene, camera, pixel, iteration, seed)
-        lens = lens_point(scene, camera, pixel, iteration, seed)
+        sample = iteration - missed_at(gbuffer.tiles, index)  # a pixel leaves out no point of its sequence
+        place = jitter(scene, camera, pixel, sample, seed)
+        lens = lens_point(scene, camera, pixel, sample, seed)
     sight = see(scene, camera, camera_ray(camera, pixel, place, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
@@ -224,9 +230,9 @@ def _trace_primary(
 
 
 def new_gbuffer(
-    launcher: Launcher, pixels: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
+    launcher: Launcher, columns: int, rows: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
 ) -> tuple[Any, Any, Any, Any]:
-    """What an iteration fills in: a `GBuffer`, and two irradiances over π.
+    """What an iteration fills in: a `GBuffer` of all pixels, and two irradiances over π.
 
     `mapped` says whether the scene has normal maps, `glows` whether the camera may see what emits, and `moving` whether
     surfaces move while the shutter is open. The first irradiance takes the place of `normal`, which nothing needs
@@ -236,10 +242,12 @@ def new_gbuffer(
     vectors = ["position", "normal", "shading_normal", "albedo"]
     vectors += ["smooth_normal"] * mapped + ["emission"] * glows
     types = [*[wp.vec3] * (len(vectors) + 1), wp.int32, wp.float32]
+    pixels = columns * rows
     block = launcher.empty(pixels * max(floats(*types), spare), wp.float32)
     *arrays, indirect, mesh, depth = carve(block, pixels, types)
     gbuffer = GBuffer()
     gbuffer.mesh, gbuffer.depth = mesh, depth
+    gbuffer.tiles = all_tiles(columns, rows, launcher)
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)
     gbuffer.anchor = launcher.empty(pixels if moving else 0, Anchor)
@@ -259,7 +267,7 @@ def trace_primary(
     iteration: int,
     seed: int,
 ) -> None:
-    """Fills the G-buffer with what the camera sees in one iteration; in iteration -1 through the pixels' centres."""
-    pixels = camera.columns * camera.rows
-    launcher.launch(_trace_primary, pixels, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
-    launcher.profile.counts["primary_rays"] += pixels
+    """Fills the tiles of the G-buffer with what the camera sees in one iteration; in -1 through the pixels' centres."""
+    count = indices(gbuffer.tiles)
+    launcher.launch(_trace_primary, count, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
+    launcher.profile.counts["primary_rays"] += gbuffer.tiles.pixels

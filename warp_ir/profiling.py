@@ -48,6 +48,10 @@ class Profile:
         self._seconds.clear()
         self.counts.clear()
 
+    def since(self, before: dict[str, float]) -> Counter[str]:
+        """Seconds by phase since `seconds` gave those `before`."""
+        return Counter({phase: max(s - before.get(phase, 0.0), 0.0) for phase, s in self.seconds().items()})
+
     def seconds(self) -> dict[str, float]:
         """Seconds so far, by phase. Waits for the GPU's pending work."""
         if self._pending:

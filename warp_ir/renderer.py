@@ -12,7 +12,6 @@ Iteration i depends on (scene, camera, settings, i) and nothing else: a picture 
 number of threads, and two films of different iterations add up to a better one.
 """
 
-import math
 import signal
 import threading
 import time
@@ -48,23 +47,8 @@ from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
+from warp_ir.stopping import Progress, Stopping
 from warp_ir.vpl import Vpls, emit_vpls, to_host
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a render has come, as `render` tells its `progress` callback after every iteration."""
-
-    iterations: int
-    """Iterations done."""
-    seconds: float
-    """Seconds of rendering so far."""
-    error: float
-    """`Film.error` as last measured; NaN before two iterations."""
-    fraction: float
-    """Share of the nearest limit that is used up, 0 to 1."""
-    seconds_left: float
-    """Estimate of what remains [s]; NaN if unknown."""
 
 
 class Renderer:
@@ -123,9 +107,9 @@ class Renderer:
             self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
         if camera.blurs and settings.filters:
             launcher.load([warp_ir.reconstruction.blur, warp_ir.reconstruction.moments])
-        pixels = camera.columns * camera.rows
         needs = {
-            "pixels": pixels,
+            "columns": camera.columns,
+            "rows": camera.rows,
             "mapped": any(data.data.normal_map_count > 0 for data in uploaded),
             "glows": settings.visible_lights or any(moment.glows for moment in scenes),
             "moving": settings.filters and surfaces_move(uploaded),
@@ -156,12 +140,13 @@ class Renderer:
         film = Film(*size, self.launcher, first.scene.frame, glows=self._needs["glows"])
         film.settings = self.settings
         if self.settings.filters:
-            seed = self.settings.seed
+            self._gbuffer.tiles, seed = film.tiles, self.settings.seed
             film.reconstruction = Reconstruction(self._moments, self.launcher, self._gbuffer, self._block, seed)
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
+        self._gbuffer.tiles = film.tiles
         number = stratum(iteration, len(self._moments).bit_length() - 1)
         moment = self._moments[number]
         moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
@@ -181,19 +166,17 @@ class Renderer:
         film = film or self.new_film()
         start = time.perf_counter() - film.seconds
         with _signals_cancel(self.launcher, film):
-            checked, error = 0, math.nan
-            done, looked = film.iterations, self._primary_seconds()
+            stopping, profile = Stopping(film, self.settings, self._chooses_tiles()), self.launcher.profile
+            before, rays = profile.seconds(), profile.counts["primary_rays"]
             while not film.interrupted and film.iterations < self.settings.iteration_limit:
                 try:
                     self.add_iteration(film, film.iterations)
                     film.seconds = time.perf_counter() - start
-                    # Measuring the error may cost as much as a cheap iteration: do it every eighth part of the way.
-                    if film.iterations >= max(2, checked + checked // 8 + 1):
-                        checked, error = film.iterations, film.error()
+                    spent = profile.since(before)
+                    reserve = self._finishing_seconds(film, spent["primary"] / (profile.counts["primary_rays"] - rays))
+                    report = stopping.look(reserve, spent["emission"] / spent.total())
                 except Cancelled:
                     break
-                looking = (self._primary_seconds() - looked) / (film.iterations - done)
-                report = _progress(film, self.settings, error, self._finishing_seconds(film, looking))
                 if progress is not None:
                     progress(report)
                 if report.fraction >= 1.0:
@@ -203,11 +186,20 @@ class Renderer:
         self._tell(film)
         return film
 
-    def _finishing_seconds(self, film: Film, looking: float) -> float:
-        """What making the picture will take [s], if camera rays through all pixels take `looking`."""
+    def _chooses_tiles(self) -> bool:
+        """Whether iterations may be for some tiles alone.
+
+        What is chosen by its noise is no unbiased mean any more, and a shutter's moments are for all pixels alike.
+        """
+        settings = self.settings
+        limited = settings.time_limit is not None or settings.target_error is not None
+        return limited and settings.iterations is None and settings.filters and len(self._moments) == 1
+
+    def _finishing_seconds(self, film: Film, per_ray: float) -> float:
+        """What making the picture will take [s], if a camera ray takes `per_ray`."""
         seconds = 0.0
         if film.reconstruction is not None:
-            seconds += looking * film.reconstruction.passes(film.iterations)
+            seconds += per_ray * film.width * film.height * film.reconstruction.passes(film.iterations)
         if self.settings.denoise:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
@@ -220,11 +212,8 @@ class Renderer:
         for what in counts:
             film.counts[what] = film.counts.get(what, 0) + counts[what] - self._told[1].get(what, 0)
         film.counts["iterations"] = film.iterations
+        film.counts["skipped_samples"] = film.skipped
         self._told = seconds, counts
-
-    def _primary_seconds(self) -> float:
-        """What camera rays have taken so far [s]; it tells what filtering will take."""
-        return self.launcher.profile.seconds().get("primary", 0.0)
 
 
 @dataclass(frozen=True)
@@ -309,21 +298,6 @@ def _modules(estimator: str, launcher: Launcher) -> list[Any]:
     if estimator == "keller":
         return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller, *common]
     return [warp_ir.gbuffer, warp_ir.estimators.path, *common]
-
-
-def _progress(film: Film, settings: RenderSettings, error: float, reserve: float) -> Progress:
-    """What is used up of each limit, `reserve` being the time [s] to keep for the end; the largest share counts."""
-    shares = [film.iterations / settings.iteration_limit]
-    if settings.time_limit is not None:
-        # An iteration that would end beyond the limit is not begun.
-        shares.append((film.seconds * (film.iterations + 1) / film.iterations + reserve) / settings.time_limit)
-    if settings.target_error is not None and error > 0.0:
-        shares.append((settings.target_error / error) ** 2)
-    elif settings.target_error is not None and error == 0.0:
-        shares.append(1.0)
-    fraction = min(max(shares), 1.0)
-    left = film.seconds * (1.0 / fraction - 1.0) if fraction > 0.0 else math.nan
-    return Progress(film.iterations, film.seconds, error, fraction, left)
 
 
 @contextmanager

@@ -2,8 +2,8 @@
 
 An estimator is built as ``Estimator(scene, camera, settings, launcher)`` from an uploaded scene and a
 `CameraData`, and then ``estimate(iteration, gbuffer, direct, indirect)`` fills, for
-every pixel, what the camera sees and its irradiance over π by way of the lights and by way of surfaces.
-What it computes depends on these arguments alone.
+every pixel of the tiles of `gbuffer`, what the camera sees and its irradiance over π by way of the lights and by
+way of surfaces. What it computes depends on these arguments alone.
 """
 
 from typing import Any, Protocol

@@ -27,6 +27,7 @@ from warp_ir.launch import Launcher
 from warp_ir.lights import arriving
 from warp_ir.sampling import iteration_scramble
 from warp_ir.settings import RenderSettings
+from warp_ir.tiles import indices, pixel_at
 from warp_ir.vpl import VplBuffer, emit_vpls
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -60,7 +61,9 @@ def _accumulate(
     indirect: wp.array[wp.vec3],
 ) -> None:
     """E/π = 1/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others; ρ is the film's."""
-    pixel = first + wp.tid()
+    pixel = pixel_at(gbuffer.tiles, first + wp.tid())
+    if pixel < 0:
+        return
     from_lights = wp.vec3(0.0)
     from_surfaces = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
@@ -110,6 +113,6 @@ class Keller:
         with launcher.phase("gather"):
             launcher.launch(
                 _accumulate,
-                gbuffer.mesh.shape[0],
+                indices(gbuffer.tiles),
                 [self._scene.data, gbuffer, vpls, self._bound, direct, indirect],
             )

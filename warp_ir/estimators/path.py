@@ -19,6 +19,7 @@ from warp_ir.launch import Launcher
 from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sample_arrival, surface_found
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
+from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -62,7 +63,9 @@ def _trace_paths(
     indirect: wp.array[wp.vec3],
 ) -> None:
     """Follows one path from what the camera sees at a pixel."""
-    pixel = first + wp.tid()
+    pixel = pixel_at(gbuffer.tiles, first + wp.tid())
+    if pixel < 0:
+        return
     once = wp.vec3(0.0)
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
@@ -130,7 +133,7 @@ class PathTracer:
         with launcher.phase("gather"):
             launcher.launch(
                 _trace_paths,
-                gbuffer.mesh.shape[0],
+                indices(gbuffer.tiles),
                 [
                     self._scene.data,
                     self._camera,

@@ -27,6 +27,7 @@ from warp_ir.lights import cut_share, lights_beyond, surface_beyond
 from warp_ir.pilot import can_pay, learn
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
+from warp_ir.tiles import indices, pixel_at
 from warp_ir.vpl import emit_vpls
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -45,7 +46,6 @@ _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the lig
 class GatherSettings:
     """What the gathering kernel needs to know beside the scene."""
 
-    columns: int  # of the film
     first_column: int  # of the film in the image, as for `CameraData`
     first_row: int
     scramble: wp.uint32
@@ -64,10 +64,10 @@ def _spread(x: int) -> int:
 
 
 @wp.func
-def _sequence_index(settings: GatherSettings, pixel: int) -> int:
+def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
     """Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels."""
-    column = (settings.first_column + pixel % settings.columns) & 0xFFFF
-    row = (settings.first_row + pixel // settings.columns) & 0xFFFF
+    column = (settings.first_column + pixel % columns) & 0xFFFF
+    row = (settings.first_row + pixel // columns) & 0xFFFF
     return _spread(column) | (_spread(row) << 1)
 
 
@@ -94,11 +94,13 @@ def _gather_pixels(
     indirect: wp.array[wp.vec3],
 ) -> None:
     """Irradiance over π of what one pixel sees."""
-    pixel = first + wp.tid()
+    pixel = pixel_at(gbuffer.tiles, first + wp.tid())
+    if pixel < 0:
+        return
     once = wp.vec3(0.0)
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
-        index = _sequence_index(settings, pixel)
+        index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
         # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
         order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
         chosen_set = (index ^ int(order)) & 63  # of as many sets as there are
@@ -188,7 +190,6 @@ class VplGatherer:
             )
             lights, surfaces = arrange(vpls, guide, launcher)
         how = GatherSettings()
-        how.columns = self._camera.columns
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
         how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
@@ -196,7 +197,7 @@ class VplGatherer:
         with launcher.phase("gather"):
             launcher.launch(
                 _gather_pixels,
-                gbuffer.mesh.shape[0],
+                indices(gbuffer.tiles),
                 [guide.scene.data, gbuffer, lights, surfaces, how, direct, indirect],
             )
 

@@ -170,15 +170,15 @@ def _compose(
 ) -> None:
     """Radiance of a pixel: that of its surface, or that of all it shows, and how far the film's mean is off that."""
     p = first + wp.tid()
-    shown = as_sampled(film, p, out.iterations)
+    shown = as_sampled(film, p)
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     other = _others(seen, p, shown.direct / exposure, shown.indirect / exposure, shown.albedo)
     edge = on_edge(seen.surfaces, film, p)
-    mean = _look_through(blur, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays), edge)
+    mean = _look_through(blur, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays), edge)
     if mean.blurred == 1 or edge or layer.direct[p][3] < 0.0:
         shown = by_rays(shown, film, mean.pixel, p, 1.0, out)
     else:
-        shown = on_surface(shown, seen, layer, p, exposure, float(out.iterations))
+        shown = on_surface(shown, seen, layer, p, exposure, float(film.count[p]))
     show(out, p, shown)
 
 

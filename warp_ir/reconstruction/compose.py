@@ -24,8 +24,7 @@ class Picture:
     """What becomes of it all, and what it lacks on edges."""
 
     rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; if there are five, albedo, normal, plain mean
-    rest: Layer  # plain mean less picture, and the variance of that by noise; -1: not on an edge
-    iterations: int
+    rest: Layer  # plain mean less picture, and how large noise makes its square on average; -1: not on an edge
     edge_rays: int
 
 
@@ -56,14 +55,14 @@ class Shown:
 
 
 @wp.func
-def as_sampled(film: FilmData, p: int, iterations: int) -> Shown:
+def as_sampled(film: FilmData, p: int) -> Shown:
     """The film's own means."""
     x = Shown()
     x.emitted = emission_of(film, p)
     x.direct = film.direct[p]
     x.indirect = film.indirect[p]
-    x.albedo = film.albedo[p] / float(iterations)
-    x.normal = film.normal[p] / float(iterations)
+    x.albedo = film.albedo[p] / float(film.count[p])
+    x.normal = film.normal[p] / float(film.count[p])
     x.plain = x.emitted + x.direct + x.indirect
     return x
 
@@ -85,7 +84,7 @@ def on_surface(sampled: Shown, seen: Observations, layer: Layer, p: int, exposur
 def by_rays(sampled: Shown, film: FilmData, pixel: Pixel, p: int, exposure: float, out: Picture) -> Shown:
     """What many rays found, times `exposure`; notes how far the plain mean of the film's own is off."""
     x = sampled
-    if pixel.rays > out.iterations:
+    if pixel.rays > film.count[p]:
         x.albedo = pixel.albedo / float(pixel.rays)
         x.normal = pixel.normal / float(pixel.rays)
         # The mean as it were of as many rays: less what the film's own saw, and more what all see.
@@ -95,7 +94,8 @@ def by_rays(sampled: Shown, film: FilmData, pixel: Pixel, p: int, exposure: floa
     x.direct = pixel.direct * exposure
     x.indirect = pixel.indirect * exposure
     if film.hits[p] > 0:
-        noise = pixel.own_noise * (exposure * exposure / float(out.iterations))
+        n = float(film.count[p])
+        noise = (pixel.own_noise * (exposure * exposure / n) + wp.vec2(1.0e-30)) * _student(n)
         more = sampled.direct - pixel.own_direct * exposure
         out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])
         more = sampled.indirect - pixel.own_indirect * exposure
@@ -128,10 +128,10 @@ def _compose(
     """Radiance of a pixel from irradiance on surfaces; on edges, how far the plain mean of the same rays is off."""
     p = first + wp.tid()
     surfaces = seen.surfaces
-    sampled = as_sampled(film, p, out.iterations)
+    sampled = as_sampled(film, p)
     shown = sampled
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    if seen.count[p] != out.iterations or on_edge(surfaces, film, p):
+    if seen.count[p] != film.count[p] or on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
         other = Lit()
         other.weight = float(seen.other_count[p])
@@ -143,10 +143,10 @@ def _compose(
             other.indirect = wp.cw_div(sampled.indirect, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
         means = mean_channels(other.direct, other.indirect)
         other.noise = wp.cw_mul(means, means) / other.weight
-        pixel = look_closely(scene, camera, seen, layer, p, other, wp.vec2i(out.iterations, out.edge_rays))
+        pixel = look_closely(scene, camera, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays))
         shown = by_rays(sampled, film, pixel, p, exposure, out)
     elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
-        shown = on_surface(sampled, seen, layer, p, exposure, float(out.iterations))
+        shown = on_surface(sampled, seen, layer, p, exposure, float(film.count[p]))
     show(out, p, shown)
 
 
@@ -155,7 +155,7 @@ def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
     """Gives back to pixels on edges what is not noise in their difference to the plain mean.
 
     That of a few pixels together is known best: if noise alone made the differences, their squares would be as large
-    as their variances on average; of squares that are r times as large, the share 1 - 1/r is real.
+    as expected on average; of squares that are r times as large, the share 1 - 1/r is real.
     """
     p = first + wp.tid()
     if out.rest.direct[p][3] >= 0.0:
@@ -173,11 +173,10 @@ def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
                         w = 1.0 / (1.0 + 0.5 * float(dx * dx + dy * dy))
                         ratio += w * wp.cw_div(wp.cw_mul(means, means), wp.vec2(d[3], i[3]) + wp.vec2(1.0e-30))
                         weights += w
-        noise = _student(float(out.iterations)) * weights
         d = out.rest.direct[p]
         i = out.rest.indirect[p]
-        out.rows[0, p] = out.rows[0, p] + value(d) * wp.max(1.0 - noise / (ratio[0] + 1.0e-30), 0.0)
-        out.rows[1, p] = out.rows[1, p] + value(i) * wp.max(1.0 - noise / (ratio[1] + 1.0e-30), 0.0)
+        out.rows[0, p] = out.rows[0, p] + value(d) * wp.max(1.0 - weights / (ratio[0] + 1.0e-30), 0.0)
+        out.rows[1, p] = out.rows[1, p] + value(i) * wp.max(1.0 - weights / (ratio[1] + 1.0e-30), 0.0)
 
 
 def edge_rays(iterations: int) -> int:
@@ -185,12 +184,12 @@ def edge_rays(iterations: int) -> int:
     return min(16 + 2 * iterations, _MOST_EDGE_RAYS)
 
 
-def new_picture(pixels: int, rest: Any, iterations: int, rays: int, features: bool, launcher: Launcher) -> Any:
+def new_picture(pixels: int, rest: Any, rays: int, features: bool, launcher: Launcher) -> Any:
     """An uninitialised `Picture`; `rest` is a `Layer` to be overwritten, `rays` are those of a pixel on an edge."""
     out = Picture()
     out.rest = rest
     out.rows = launcher.empty((5 if features else 2, pixels), wp.vec3)
-    out.iterations, out.edge_rays = iterations, rays
+    out.edge_rays = rays
     return out
 
 

@@ -17,6 +17,7 @@ from warp_ir.launch import Launcher
 from warp_ir.reconstruction.observations import Observations, add_other, add_sample
 from warp_ir.reconstruction.surfaces import MATCH, pixel_around, same_surface
 from warp_ir.surface import Hit, shading_normal
+from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -110,12 +111,13 @@ def _aim(
     pixels: wp.array2d[wp.int32],
 ) -> None:
     """Says for which pixel each sample is (first row); those that no pixel's centre shows stay where they are."""
-    p = first + wp.tid()
+    i = first + wp.tid()
+    p = pixel_at(gbuffer.tiles, i)
     surfaces = seen.surfaces
     none = surfaces.columns * surfaces.rows
-    pixels[0, p] = none
-    pixels[1, p] = p
-    if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
+    pixels[0, i] = none
+    pixels[1, i] = p
+    if p >= 0 and gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
         anchor = Anchor()
         if blur.moves == 1:
             anchor = gbuffer.anchor[p]
@@ -126,19 +128,20 @@ def _aim(
         if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
             q = y * surfaces.columns + x
             if same_surface(surfaces, q, point.position, point.normal) > MATCH:
-                pixels[0, p] = q
+                pixels[0, i] = q
             else:
                 for k in range(9):
                     near = pixel_around(surfaces, q, k)
                     if same_surface(surfaces, near, point.position, point.normal) > MATCH:
-                        pixels[0, p] = near
-        if pixels[0, p] == none:
+                        pixels[0, i] = near
+        if pixels[0, i] == none:
             add_other(seen, p, direct[p], indirect[p])
 
 
 @wp.kernel
 def _take(
     first: int,
+    samples: int,
     pixels: wp.array2d[wp.int32],
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
@@ -146,9 +149,8 @@ def _take(
 ) -> None:
     """Adds to each pixel the samples that are for it: a run of the sorted ones."""
     p = first + wp.tid()
-    count = seen.count.shape[0]
-    k = int(wp.lower_bound(pixels[0], 0, count, p))
-    while k < count and pixels[0, k] == p:
+    k = int(wp.lower_bound(pixels[0], 0, samples, p))
+    while k < samples and pixels[0, k] == p:
         add_sample(seen, p, direct[pixels[1, k]], indirect[pixels[1, k]])
         k += 1
 
@@ -216,11 +218,11 @@ def observe_blurred(
     blur: Any, seen: Any, moment: int, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher
 ) -> None:
     """Adds one iteration's samples of irradiance over π, made at a moment, to `Observations`."""
-    count = seen.count.shape[0]
+    count = indices(gbuffer.tiles)
     order = launcher.kept("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
     launcher.launch(_aim, count, [blur, moment, gbuffer, direct, indirect, seen, order])
     wp.utils.radix_sort_pairs(order[0], order[1], count)
-    launcher.launch(_take, count, [order, direct, indirect, seen])
+    launcher.launch(_take, seen.count.shape[0], [count, order, direct, indirect, seen])
 
 
 def guess_noise(seen: Any, launcher: Launcher) -> None:

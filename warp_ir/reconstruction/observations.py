@@ -9,6 +9,7 @@ from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.launch import Launcher, copied
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
 from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
+from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -84,7 +85,9 @@ def _observe(
     seen: Observations,
 ) -> None:
     """Adds one iteration's sample of a pixel to those on its surface, or on none."""
-    p = first + wp.tid()
+    p = pixel_at(gbuffer.tiles, first + wp.tid())
+    if p < 0:
+        return
     surfaces = seen.surfaces
     if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
         if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > MATCH:
@@ -189,7 +192,7 @@ def sums(seen: Any) -> dict[str, Any]:
 
 def observe(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher) -> None:
     """Adds one iteration's samples of irradiance over π to `Observations`."""
-    launcher.launch(_observe, gbuffer.mesh.shape[0], [gbuffer, direct, indirect, seen])
+    launcher.launch(_observe, indices(gbuffer.tiles), [gbuffer, direct, indirect, seen])
 
 
 def average(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:

@@ -82,7 +82,7 @@ class Reconstruction:
             seen = average(self._seen, noise, layer, launcher)
             layer, rest = filter_layer(seen.surfaces, layer, other, launcher)
             rays = edge_rays(iterations) if self._blur is None else blur_rays(iterations)
-            out = new_picture(seen.count.shape[0], rest, iterations, rays, features, launcher)
+            out = new_picture(seen.count.shape[0], rest, rays, features, launcher)
             if self._blur is not None:
                 guess_noise(seen, launcher)
                 compose_blurred(self._blur, seen, layer, film, self._exposure, out, launcher)
