@@ -237,7 +237,7 @@ class Film:
         for name in FilmData.vars:
             mine, theirs = (getattr(film._data, name).numpy() for film in (self, other))
             if name in _RADIANCE:
-                mine = mine * (1.0 - share) + theirs * share
+                mine = mine + (theirs - mine) * share[: len(mine)]  # no rows of emission: there is none
             elif name == "deviation":
                 mine, theirs = (x.astype(np.float64) ** 2 for x in (mine, theirs))
                 mine = np.sqrt(mine * (1.0 - share) + theirs * share + share * (1.0 - share) * apart**2)
