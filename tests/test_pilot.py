@@ -8,13 +8,17 @@ import pytest
 
 import warp_ir as ir
 import warp_ir.estimators.vpl
+from tests.physics.closed_form import assert_mean
+from warp_ir import procedural
 from warp_ir.guide import CELLS, SIDES, unguided
 from warp_ir.metrics import z_scores
 from warp_ir.pilot.emitters import BY_POWER, probabilities
+from warp_ir.pilot.probes import look
 from warp_ir.pilot.rings import nearest_point
 from warp_ir.pilot.worth import means
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
+from warp_ir.scene import LightKind
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
@@ -191,3 +195,26 @@ def test_worth_of_cells():
     assert table.shape == (SIDES * CELLS**3,)
     assert np.allclose(table[:2], [2.0, 4.0], rtol=1e-3)
     assert np.isclose(table[CELLS], 3.0, rtol=1e-3) and np.isclose(table[-1], 3.0, rtol=1e-3)
+
+
+def test_both_halves_of_the_pilot_see_the_picture():
+    """What is learned from one half of the camera paths is measured by the other: both are spread over the image."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=64, height=64, filter=False))
+    camera = renderer._moments[0].camera
+    seen = look(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
+    middle = np.median(seen.position[seen.bounce == 0, :2], axis=0)
+    for half in (seen.early, ~seen.early):
+        beyond = (seen.position[half & (seen.bounce == 0), :2] > middle).mean(axis=0)
+        assert np.all(np.abs(beyond - 0.5) < 0.05)
+
+
+def test_more_paths_where_light_escapes():
+    """Under an open sky few paths leave a VPL: there are more of them, and the light is that of a horizontal plane.
+
+    The square is 2/π of the disk through which the light comes in, seen from above; less from elsewhere, and nothing
+    from below: fewer than a third of the paths meet it, and half of those are reflected.
+    """
+    sky = ir.Light("sky", LightKind.DOME, (1.0, 1.0, 1.0))
+    film = film_of(procedural.floor(sky, albedo=0.5), width=32, height=32, iterations=16)
+    assert film.counts["light_paths"] >= 16 * 64 * 8
+    assert_mean(film, 0.5)

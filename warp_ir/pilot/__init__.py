@@ -32,6 +32,8 @@ _APART = 0.25
 """Of the scene's diagonal: lights that are closer together than that are seen together, or not at all."""
 _FEWEST, _MOST = 1024, 2048
 """Camera paths; one for every sixteen pixels within these limits, so that they take a small part of an iteration."""
+_VPLS_PER_PATH = 1.5
+"""On surfaces, and kept, as in a room. Where light escapes, or VPLs are dropped, more paths make up for it."""
 _MOST_PATHS = 16
 _PIXELS_PER_PATH = 2
 """Of the image at least, for every light path that is started: so the paths remain cheap next to the gathering."""
@@ -70,16 +72,20 @@ def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderS
     # VPLs are dropped only where more paths can make up for them: else there would be less noise, but in larger spots.
     most = min(pixels // (_PIXELS_PER_PATH * settings.path_count), _MOST_PATHS)
     chosen = aim = worth = None
+    left = _VPLS_PER_PATH
     if scene.emits:
         sightings = look(scene, camera, launcher, paths, settings)
         if sightings.score.any():
             chosen, aim = choose_emitters(scene, sightings, launcher), aim_at_foci(scene, sightings, launcher)
             guide = replace(guide, scene=chosen or scene, aim=aim or guide.aim)
             if most > 1:
-                worth = judge(connect(guide, launcher, sightings, paths // 2, settings), guide, launcher)
+                found = connect(guide, launcher, sightings, paths // 2, settings)
+                worth, left = judge(found, guide, launcher), found.per_path
     if worth is not None:
-        paths = min(max(round(1.0 / worth.kept), 1), most)
-        guide = replace(guide, worth=worth.table, paths=paths, density=worth.density)
+        left *= worth.kept
+        guide = replace(guide, worth=worth.table, density=worth.density)
+    if left > 0.0:
+        guide = replace(guide, paths=max(min(round(_VPLS_PER_PATH / left), most), 1))
     decided = {"guided_emitters": chosen, "guided_far_lights": aim, "guided_vpls": worth}
     for name, learned in decided.items():
         launcher.profile.counts[name] = int(learned is not None)

@@ -117,8 +117,8 @@ def _look(first: int, scene: SceneData, camera: CameraData, scramble: wp.uint32,
 class Sightings:
     """The vertices of the camera paths, without those that were not there."""
 
-    even: npt.NDArray[np.bool_]
-    """[n], whether the path has an even number: half of them."""
+    early: npt.NDArray[np.bool_]
+    """[n], whether the path is one of the first half."""
     bounce: npt.NDArray[np.int64]
     """[n], reflections of the light before it comes to the vertex."""
     emitter: npt.NDArray[np.int64]
@@ -158,7 +158,8 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
         score /= scale
         rows.weight = launcher.array(rows.weight.numpy() / scale, wp.float32)
     return Sightings(
-        even=(np.arange(n) // (_VERTICES * _ASKED) % 2 == 0)[there],
+        # Runs of the sequence: its points of even number would all be in one half of the image.
+        early=(np.arange(n) < n // 2)[there],
         bounce=bounce[there],
         emitter=emitter[there].astype(np.int64),
         score=clipped(score[there]),
@@ -221,6 +222,8 @@ class Connections:
     """[n], sum of the channels."""
     gives: npt.NDArray[np.float64]
     """[n], per intensity."""
+    per_path: float
+    """VPLs on surfaces that a light path leaves."""
     extent: float
     """Edge of the cube that the cells divide, in the device frame."""
 
@@ -247,5 +250,6 @@ def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, setti
         cell=cells.numpy()[:n].astype(np.int64),
         intensity=_finite(vpls.intensity.numpy()[chosen]).sum(axis=1),
         gives=_finite(gives.numpy()[: n * _CONNECTIONS]).reshape(n, _CONNECTIONS).mean(axis=1),
+        per_path=on_surfaces / (paths * guide.paths),
         extent=extent,
     )
