@@ -4,7 +4,8 @@ At a point x, f_k = I_k min(G(x, y_k), b_k) is what VPL k gives if it is visible
 
 * **Weigh in blocks.** Sixteen VPLs side by side are weighed in vector registers; on CUDA a thread weighs one at a time.
 * **Resample visibility.** M of the VPLs are chosen in proportion to f and only they get a shadow ray, each
-  standing for S/M, S being the sum of all f: unbiased (systematic resampling; Talbot et al. 2005 for the idea).
+  standing for S/M, S being the sum of all f: unbiased (systematic resampling along a curve through space; Talbot
+  et al. 2005 for the idea).
 * **Interleave.** The VPLs come in sets, and a pixel weighs one of them, its neighbours another (Keller and Heidrich
   2001): the cost of a pixel does not grow with the number of VPLs.
 * **Bound.** min(G, b) takes away the weak singularity; what it takes is given back by `estimators.vpl`.
@@ -149,6 +150,24 @@ def _weigh_block(lit: VplSets, block: int, x: Receiver) -> vec16:
 
 
 @wp.func_native("""
+    wp::vec_t<16, float> out;
+    float passed = 0.0f;
+    for (int i = 0; i < 16; ++i) {
+        out[i] = passed;
+        passed += sums[i];
+    }
+    for (int i = 0; i < 16; ++i) {
+        const float target = (ceilf(out[i] / share - u) + u) * share - out[i];
+        out[i] = target > 0.0f ? target : 0.0f;
+    }
+    return out;
+""")
+def _first_targets(sums: vec16, share: float, u: float) -> vec16:
+    """Of the targets (0, 1, 2, ... + u) share along all lanes the first in every lane, from where the lane begins."""
+    ...
+
+
+@wp.func_native("""
     wp::vec_t<16, int> out;
     for (int i = 0; i < 16; ++i) out[i] = count[i] + (sum[i] <= target[i] ? 1 : 0);
     return out;
@@ -194,23 +213,21 @@ def _shadowed(
 
 
 @wp.func
-def gather(
-    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
-) -> wp.vec3:
+def gather(scene: SceneData, lit: VplSets, which: float, x: Receiver, u: float, rays: int, max_bounce: int) -> wp.vec3:
     """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
 
-    `chosen_set` is taken modulo their number. `u` in [0, 1)² are the offsets of the two systematic choices. VPLs of
-    more than `max_bounce` reflections are dark.
+    `which` in [0, 1) chooses the set, `u` in [0, 1) is the offset of the systematic choice of VPLs. Those of more than
+    `max_bounce` reflections are dark.
     """
-    return _gather(scene.address, lit, chosen_set, x, u, rays, max_bounce)
+    return _gather(scene.address, lit, which, x, u, rays, max_bounce)
 
 
 @wp.func(inline=False)
 def _gather(
-    address: wp.uint64, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+    address: wp.uint64, lit: VplSets, which: float, x: Receiver, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
     scene = scene_at(address)[0]
-    chosen = chosen_set & (lit.sets - 1)
+    chosen = int(which * float(lit.sets))
     if on_cuda():
         return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
     return _gather_in_blocks(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
@@ -218,49 +235,66 @@ def _gather(
 
 @wp.func
 def _gather_in_blocks(
-    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+    scene: SceneData, lit: VplSets, chosen: int, x: Receiver, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
+    """Every lane is a part of the set's curve; the M targets lie along one lane after the other."""
     out = wp.vec3(0.0)
-    begin = chosen_set * lit.blocks
+    begin = chosen * lit.blocks
     sums = vec16()
     for block in range(begin, begin + lit.blocks):
         sums += _weigh_block(lit, block, x)
     total = _sum(sums)
     if total <= 0.0:
         return out
-    # Every lane is a stratum: one candidate from each, in proportion to f ...
-    target = sums * u[0]
+    share = total / float(rays)
+    # The first target in every lane is looked for in all at once. More in a lane are rare, or few VPLs give much.
+    target = _first_targets(sums, share, u)
     running = vec16()
-    candidate = vec16i()
+    count = vec16i()
     for block in range(begin, begin + lit.blocks):
         running += _weigh_block(lit, block, x)
-        candidate = _count_below(running, target, candidate)
-    # ... and of the sixteen candidates M, in proportion to the sums of their lanes.
-    share = total / float(rays)
+        count = _count_below(running, target, count)
     passed = float(0.0)
     drawn = int(0)
     for lane in range(_LANES):
-        passed += sums[lane]
-        while drawn < rays and (float(drawn) + u[1]) * share < passed:
-            k = wp.min(candidate[lane], lit.blocks - 1)
+        k = count[lane]
+        goal = target[lane]
+        while drawn < rays and (float(drawn) + u) * share < passed + sums[lane]:
+            if goal > target[lane]:
+                k = _count_in_lane(lit, begin, lane, x, goal)
             slot = _LANES * begin + lit.blocks * lane + k
-            if slot < lit.count:
+            if k < lit.blocks and slot < lit.count:
                 row = _ROWS * (begin + k)
                 p = wp.vec4(
                     lit.rows[row][lane], lit.rows[row + 1][lane], lit.rows[row + 2][lane], lit.rows[row + 3][lane]
                 )
                 out += _shadowed(scene, lit, x, slot, p, lit.colors[slot], share, max_bounce)
+            goal += share
             drawn += 1
+        passed += sums[lane]
     return out
 
 
 @wp.func
+def _count_in_lane(lit: VplSets, begin: int, lane: int, x: Receiver, target: float) -> int:
+    """VPLs of a lane before its running sum passes a target."""
+    running = float(0.0)
+    k = int(0)
+    while k < lit.blocks:
+        running += _weigh_block(lit, begin + k, x)[lane]
+        if running > target:
+            break
+        k += 1
+    return k
+
+
+@wp.func
 def _gather_one_by_one(
-    scene: SceneData, lit: VplSets, chosen_set: int, x: Receiver, u: wp.vec2, rays: int, max_bounce: int
+    scene: SceneData, lit: VplSets, chosen: int, x: Receiver, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
     """The same for a thread without lanes: one running sum, M targets along it."""
     out = wp.vec3(0.0)
-    begin = chosen_set * lit.blocks * _LANES
+    begin = chosen * lit.blocks * _LANES
     end = wp.min(begin + lit.blocks * _LANES, lit.count)
     total = float(0.0)
     for slot in range(begin, end):
@@ -272,7 +306,7 @@ def _gather_one_by_one(
     drawn = int(0)
     for slot in range(begin, end):
         running += _weigh_one(scene, lit, x, slot)
-        while drawn < rays and (float(drawn) + u[1]) * share < running:
+        while drawn < rays and (float(drawn) + u) * share < running:
             position = lit.vpls.position[lit.order[slot]]
             out += _shadowed(scene, lit, x, slot, position, _color_of(lit, slot), share, max_bounce)
             drawn += 1

@@ -101,26 +101,25 @@ def _gather_pixels(
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
-        # Every square of 8 x 8 pixels takes all sets, each square in another order: no pattern repeats.
-        order = sampling.hash_combine(settings.scramble, wp.uint32(index >> 6))
-        chosen_set = (index ^ int(order)) & 63  # of as many sets as there are
+        # Neighbours weigh different sets, as any coordinate of a point: nothing else that is sampled hangs on which.
+        which = sampling.sample_1d(scene.sobol, index, 0, settings.scramble)
         x = _first_receiver(gbuffer, pixel)
         throughput = wp.vec3(1.0)
         reach = 1.0 / wp.sqrt(lights.bound.least)
         depth = int(0)
         rays = settings.rays
         while depth <= settings.max_bounces:
-            u = sampling.sample_2d(scene.sobol, index, 4 * depth, settings.scramble)
+            u = sampling.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
             bounces = settings.max_bounces - depth
-            by_lights = gather(scene, lights, chosen_set, x, u, rays[0], bounces)
-            by_surfaces = gather(scene, surfaces, chosen_set, x, u, rays[1], bounces)
+            by_lights = gather(scene, lights, which, x, u[0], rays[0], bounces)
+            by_surfaces = gather(scene, surfaces, which, x, u[1], rays[1], bounces)
             if depth == 0:
                 once = by_lights
                 more = by_surfaces
             else:
                 more += wp.cw_mul(throughput, by_lights + by_surfaces)
 
-            v = sampling.sample_2d(scene.sobol, index, 4 * depth + 2, settings.scramble)
+            v = sampling.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
             direction = sampling.to_cosine_hemisphere(v, x.shading_normal)
             if wp.dot(direction, x.normal) <= 0.0:
                 break
