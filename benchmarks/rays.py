@@ -82,7 +82,7 @@ def _read_vpls(first: int, scene: SceneData, gbuffer: GBuffer, vpls: VplBuffer, 
     """The loop over VPLs with nothing in it but reading them."""
     i = first + wp.tid()
     total = wp.vec3(0.0)
-    for k in range(vpls.count):
+    for k in range(vpls.count[0]):
         total += vpls.intensity[k] * (vpls.position[k][0] + vpls.normal[k][0])
     out[i] = total
 
@@ -92,7 +92,7 @@ def _light_by_vpls(first: int, scene: SceneData, gbuffer: GBuffer, vpls: VplBuff
     """Unshadowed light: I G summed."""
     i = first + wp.tid()
     total = wp.vec3(0.0)
-    for k in range(vpls.count):
+    for k in range(vpls.count[0]):
         g = geometry_term(
             gbuffer.position[i], gbuffer.normal[i], gbuffer.shading_normal[i], vpls.position[k], vpls.normal[k]
         )
@@ -105,7 +105,7 @@ def _shadowed_vpls(first: int, scene: SceneData, gbuffer: GBuffer, vpls: VplBuff
     """Light with its shadows: I G V summed."""
     i = first + wp.tid()
     total = wp.vec3(0.0)
-    for k in range(vpls.count):
+    for k in range(vpls.count[0]):
         g = geometry_term(
             gbuffer.position[i], gbuffer.normal[i], gbuffer.shading_normal[i], vpls.position[k], vpls.normal[k]
         )
@@ -136,7 +136,7 @@ def ray_sets(camera: Any, gbuffer: Any, vpls: Any, launcher: Launcher) -> dict[s
     # A point on the unit sphere around the tip of the normal is a cosine-weighted direction.
     sphere = random.normal(size=normal.shape)
     diffuse = normal + sphere / np.linalg.norm(sphere, axis=1, keepdims=True) * 0.9999
-    near = vpls.position.numpy()[: vpls.count]
+    near = vpls.position.numpy()[: vpls.count.numpy()[0]]
     near = near[near[:, 3] == 1.0, :3]
     result = {"camera": (origins.numpy(), directions.numpy()), "diffuse": (position, diffuse.astype(np.float32))}
     if len(near) and len(position):
@@ -217,9 +217,10 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     gbuffer, *_ = new_gbuffer(launcher, side, side, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, small, launcher, gbuffer, iteration=0, seed=0)
     out = launcher.empty(side * side, wp.vec3)
-    gather: dict[str, Any] = {"scene": name, "vpls": vpls.count}
+    n = int(vpls.count.numpy()[0])
+    gather: dict[str, Any] = {"scene": name, "vpls": n}
     for label, kernel in {"empty": _read_vpls, "unshadowed": _light_by_vpls, "shadowed": _shadowed_vpls}.items():
-        gather[label] = side * side * vpls.count / timed(kernel, side * side, [gbuffer, vpls, out])
+        gather[label] = side * side * n / timed(kernel, side * side, [gbuffer, vpls, out])
     return rows, gather
 
 

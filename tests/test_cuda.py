@@ -4,6 +4,7 @@ import ast
 import ctypes
 import importlib
 import struct
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,12 @@ import pytest
 import warp as wp
 
 import warp_ir as ir
+import warp_ir.estimators.vpl
+import warp_ir.vpl
 from tests.physics.test_invariance import room
 from warp_ir.device_scene import SceneData
+from warp_ir.procedural import cornell_box, furnace
+from warp_ir.renderer import Renderer
 
 wp.set_module_options({"enable_backward": False})
 
@@ -108,6 +113,98 @@ def resources(cubin):
             found.setdefault(text(name, sections[".strtab"]), {})[attribute] = value
         place += length
     return {k: (v[_REGISTERS], v.get(_FRAME, 0)) for k, v in found.items() if _REGISTERS in v and "$" not in k}
+
+
+READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")
+
+
+@pytest.mark.parametrize(
+    "scene, settings, room",
+    [
+        (cornell_box(), {}, None),
+        (cornell_box(), {"max_bounces": 0}, None),
+        (cornell_box(), {"light_paths": 4096}, 1000),  # of 10 000 VPLs on surfaces
+        (cornell_box(), {"light_paths": 16}, 1),
+        (cornell_box(), {"estimator": "keller"}, None),
+        (cornell_box(), {"estimator": "path"}, None),
+        (furnace(0.5, 0.0, level=1), {}, None),
+    ],
+)
+def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
+    """An iteration does without whatever the host would have to wait for, and comes to the same bits without it.
+
+    A launcher that takes the CPU for a device to wait for runs kernels over all rows that there may be.
+    """
+    settings = ir.RenderSettings(**{"width": 24, "height": 24, "light_paths": 64, "iterations": 3, **settings})
+    if room is not None:
+        monkeypatch.setattr(warp_ir.vpl, "_MOST_ROOM", room)
+    expected = ir.render(scene, settings)
+    renderer = Renderer(scene, settings)
+    renderer.launcher.waits = False
+    film = renderer.new_film()
+    with blind(monkeypatch):
+        for iteration in range(3):
+            renderer.add_iteration(film, iteration)
+    renderer._tell(film)
+    np.testing.assert_array_equal(film.radiance(), expected.radiance())
+    assert film.counts == expected.counts
+    if room is not None:
+        assert film.counts["vpls"] == 3 * (settings.light_paths + room)
+
+
+@pytest.mark.parametrize("name", ["rooms", "house"])
+def test_guided_iterations_read_nothing_back(name, monkeypatch):
+    """The same after the pilot, which is sent once, and may look at what it has found."""
+    monkeypatch.syspath_prepend(str(PACKAGE.parent / "benchmarks"))
+    import wide_scenes
+
+    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 1)
+    settings = ir.RenderSettings(width=24, height=24, light_paths=64, iterations=4)
+    scene = getattr(wide_scenes, name)()
+    expected = ir.render(scene, settings)
+    assert expected.counts["guided_vpls"] == 1
+    renderer = Renderer(scene, settings)
+    renderer.launcher.waits = False
+    film = renderer.new_film()
+    for iteration in range(2):
+        renderer.add_iteration(film, iteration)
+    with blind(monkeypatch):
+        for iteration in range(2, 4):
+            renderer.add_iteration(film, iteration)
+    np.testing.assert_array_equal(film.radiance(), expected.radiance())
+
+
+def test_reading_is_noticed(monkeypatch):
+    """Where nothing may be read, every way to read fails, and so does an iteration that counts its VPLs."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=8, height=8, light_paths=8))
+    array = renderer.launcher.zeros(1, wp.int32)
+    with blind(monkeypatch):
+        for read in (array.numpy, array.list, lambda: array.to("cpu"), lambda: np.asarray(array), lambda: str(array)):
+            with pytest.raises(AssertionError, match="read back"):
+                read()
+        with pytest.raises(AssertionError, match="read back"):
+            renderer.add_iteration(renderer.new_film(), 0)
+    assert array.numpy().tolist() == [0]
+
+
+@contextmanager
+def blind(monkeypatch):
+    """Lets nothing be read from an array on a device while it lasts."""
+
+    def fail(*_, **__):
+        raise AssertionError("read back")
+
+    with monkeypatch.context() as context:
+        for name in READS:
+            is_property = isinstance(getattr(wp.array, name), property)
+            context.setattr(wp.array, name, property(fail) if is_property else fail)
+        yield
+
+
+def test_only_the_launcher_knows_the_device():
+    """Whether a kernel's work can be looked at is asked in few places: so the CPU can stand for CUDA in these tests."""
+    asking = {path.name for path in PACKAGE.rglob("*.py") if "is_cuda" in path.read_text()}
+    assert asking == {"launch.py", "profiling.py", "gather.py", "build.py", "trees.py"}
 
 
 @pytest.mark.gpu

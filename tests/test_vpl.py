@@ -92,3 +92,30 @@ def test_iterations_are_independent_and_repeatable(device):
     other = ir.trace_vpls(scene, ir.RenderSettings(), device=device, iteration=1)
     assert not np.array_equal(first.positions[:100], other.positions[:100])
     assert not np.array_equal(first.positions[:100], trace(scene, device, seed=1).positions[:100])
+
+
+@pytest.mark.parametrize("noted", [0.9, 0.02])
+def test_those_that_find_room_stand_for_all(monkeypatch, noted, device):
+    """Of 8000 VPLs on surfaces 1000 are kept, each shining for eight, lights all: the same flux, at every bounce, too.
+
+    In a furnace all VPLs have one intensity, so the flux as a whole is the same to rounding; a bounce with a share p of
+    the VPLs keeps 1000 p of them on the mean, spread by less than √(1000 p (1 - p)); five of them.
+    """
+    monkeypatch.setattr("warp_ir.vpl._FOLLOWED_AGAIN", noted)  # many paths are followed again, or few
+    scene, settings = furnace(0.5, 2.0, shape="cube"), {"light_paths": 8192, "seed": 3}
+    every = trace(scene, device, **settings)
+    monkeypatch.setattr("warp_ir.vpl._MOST_ROOM", 1000)
+    some = trace(scene, device, **settings)
+    assert len(some.bounce) == 8192 + 1000
+    np.testing.assert_array_equal(some.positions[:8192], every.positions[:8192])
+    np.testing.assert_array_equal(some.intensity[:8192], every.intensity[:8192])
+    rows = {tuple(p): k for k, p in enumerate(every.positions[8192:])}
+    kept = np.array([rows[tuple(p)] for p in some.positions[8192:]])
+    assert (np.diff(kept) >= 7).all() and (np.diff(kept) <= 9).all()
+    times = some.intensity[8192:] / every.intensity[8192:][kept]
+    np.testing.assert_allclose(times, (len(every.bounce) - 8192) / 1000.0, rtol=1e-6)
+    np.testing.assert_allclose(some.intensity.sum(axis=0), every.intensity.sum(axis=0), rtol=1e-4)
+    for bounce in range(1, 6):
+        share = (every.bounce[8192:] == bounce).mean()
+        spread = math.sqrt(1000 * share * (1 - share))
+        assert abs((some.bounce[8192:] == bounce).sum() - 1000 * share) < 5 * spread

@@ -31,14 +31,18 @@ LANES = 16
 _LANES = wp.constant(LANES)
 _ROWS = wp.constant(10)
 _SHAPE_ROWS = wp.constant(7)
-BLOCKS_PER_SET = 16
+_BLOCKS_PER_SET = wp.constant(16)
 """A pixel weighs about 16 x 16 VPLs: a fraction of the cost of the shadow rays that follow."""
-MAX_SETS = 64
-_INFINITE = 3.0e38
-_UNBOUNDED = wp.constant(_INFINITE)
-_AREAS = 20.0
+_MAX_SETS = wp.constant(64)
+_PI = wp.constant(wp.float64(math.pi))
+_UNBOUNDED = wp.constant(3.0e38)
+_LAST = wp.constant(2**31 - 1)
+_AREAS = wp.constant(wp.float64(20.0))
 """The bound takes hold within a disk of as many times the area that a VPL stands for. Small: noise from VPLs close
 by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
+
+ON_LIGHTS, ON_SURFACES = wp.constant(0), wp.constant(1)
+"""The rows of what `arrange` returns."""
 
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -53,7 +57,7 @@ class VplSets:
     and end of the ramp by which its VPLs are weighed (`light_control.emphasis`).
     """
 
-    sets: int
+    sets: int  # this and what follows from the number of VPLs is known on the device alone
     blocks: int  # per set
     count: int  # VPLs in all sets
     bound: Bound
@@ -213,20 +217,37 @@ def _shadowed(
 
 
 @wp.func
-def gather(scene: SceneData, lit: VplSets, which: float, x: Receiver, u: float, rays: int, max_bounce: int) -> wp.vec3:
+def gather(
+    scene: SceneData,
+    parts: wp.array[VplSets],
+    part: int,
+    which: float,
+    x: Receiver,
+    u: float,
+    rays: int,
+    max_bounce: int,
+) -> wp.vec3:
     """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
 
-    `which` in [0, 1) chooses the set, `u` in [0, 1) is the offset of the systematic choice of VPLs. Those of more than
-    `max_bounce` reflections are dark.
+    `part` is `ON_LIGHTS` or `ON_SURFACES`. `which` in [0, 1) chooses the set, `u` in [0, 1) is the offset of the
+    systematic choice of VPLs. Those of more than `max_bounce` reflections are dark.
     """
-    return _gather(scene.address, lit, which, x, u, rays, max_bounce)
+    return _gather(scene.address, parts, part, which, x, u, rays, max_bounce)
 
 
 @wp.func(inline=False)
 def _gather(
-    address: wp.uint64, lit: VplSets, which: float, x: Receiver, u: float, rays: int, max_bounce: int
+    address: wp.uint64,
+    parts: wp.array[VplSets],
+    part: int,
+    which: float,
+    x: Receiver,
+    u: float,
+    rays: int,
+    max_bounce: int,
 ) -> wp.vec3:
     scene = scene_at(address)[0]
+    lit = parts[part]
     chosen = int(which * float(lit.sets))
     if on_cuda():
         return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
@@ -357,32 +378,86 @@ def _spread_bits(x: int) -> int:
     return (y | (y << 2)) & 0x249249
 
 
+@wp.func
+def _divided(count: int) -> wp.vec2i:
+    """Sets, as many as a pixel is spared, and the blocks of each."""
+    blocks = (count + _LANES - 1) // _LANES
+    sets = int(1)
+    while sets < _MAX_SETS and blocks >= 2 * sets * _BLOCKS_PER_SET:
+        sets *= 2
+    return wp.vec2i(sets, (blocks + sets - 1) // sets)
+
+
+@wp.func
+def _with(lit: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
+    out = lit
+    out.sets = divided[0]
+    out.blocks = divided[1]
+    out.count = count
+    out.bound = bound
+    return out
+
+
+@wp.func
+def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
+    """The bound where a pixel weighs so many VPLs, so many of them on lights; `arrange` knows the rest."""
+    out = Bound()
+    out.least = _UNBOUNDED
+    if area > wp.float64(0.0):
+        out.least = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
+    out.per_density = float(_PI * wp.float64(on_lights) / _AREAS)
+    return out
+
+
 @wp.kernel
-def _sort_key(
-    first: int, lights: VplSets, surfaces: VplSets, extent: float, keys: wp.array[wp.int32], order: wp.array[wp.int32]
+def _divide(
+    first: int,
+    lights: VplSets,
+    surfaces: VplSets,
+    extent: float,
+    density: wp.float64,
+    area: wp.float64,
+    keys: wp.array[wp.int32],
+    parts: wp.array[VplSets],
 ) -> None:
-    """Lights before surfaces, then the set, then the place on the Z-order curve."""
+    """Divides the VPLs into sets, and gives them keys to be sorted by.
+
+    Lights come before surfaces, then counts the set, then the place on the Z-order curve; rows without a VPL come last.
+    """
     i = first + wp.tid()
-    order[i] = i
-    p = lights.vpls.position[i]
-    code = int(0)
-    for k in range(3):
-        cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
-        code = code | (_spread_bits(cell) << k)
-    if i < lights.count:
-        keys[i] = code | ((i // (lights.blocks * _LANES)) << 18)
-    else:
-        keys[i] = code | (((i - lights.count) // (surfaces.blocks * _LANES)) << 18) | (1 << 24)
+    vpls = lights.vpls
+    of_lights = _divided(vpls.on_lights)
+    of_surfaces = _divided(vpls.count[0] - vpls.on_lights)
+    if i == 0:
+        weighed = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
+        bound = _bound(weighed, _LANES * of_lights[1], density, area)
+        parts[0] = _with(lights, of_lights, vpls.on_lights, bound)
+        parts[1] = _with(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
+    lights.order[i] = i
+    keys[i] = _LAST
+    if i < vpls.count[0]:
+        p = vpls.position[i]
+        code = int(0)
+        for k in range(3):
+            cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
+            code = code | (_spread_bits(cell) << k)
+        if i < vpls.on_lights:
+            keys[i] = code | ((i // (of_lights[1] * _LANES)) << 18)
+        else:
+            keys[i] = code | (((i - vpls.on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 24)
 
 
 @wp.kernel
-def _pack(first: int, lights: VplSets, surfaces: VplSets) -> None:
+def _pack(first: int, parts: wp.array[VplSets]) -> None:
     """Writes block `i`, those of the lights first: every lane runs along a part of the set's curve of its own."""
     i = first + wp.tid()
-    lit = lights
-    if i >= lights.sets * lights.blocks:
-        i -= lights.sets * lights.blocks
-        lit = surfaces
+    part = int(ON_LIGHTS)
+    if i >= parts[part].sets * parts[part].blocks:
+        i -= parts[part].sets * parts[part].blocks
+        part = int(ON_SURFACES)
+    lit = parts[part]
+    if i >= lit.sets * lit.blocks:
+        return
     begin = (i // lit.blocks) * lit.blocks * _LANES
     for lane in range(_LANES):
         slot = begin + lit.blocks * lane + i % lit.blocks
@@ -405,9 +480,12 @@ def _pack(first: int, lights: VplSets, surfaces: VplSets) -> None:
 
 
 @wp.kernel
-def _pack_shaping(first: int, scene: SceneData, lit: VplSets) -> None:
+def _pack_shaping(first: int, scene: SceneData, parts: wp.array[VplSets]) -> None:
     """Writes the rows of shaping of block `i`."""
     i = first + wp.tid()
+    lit = parts[ON_LIGHTS]
+    if i >= lit.sets * lit.blocks:
+        return
     begin = (i // lit.blocks) * lit.blocks * _LANES
     for lane in range(_LANES):
         slot = begin + lit.blocks * lane + i % lit.blocks
@@ -425,47 +503,36 @@ def _pack_shaping(first: int, scene: SceneData, lit: VplSets) -> None:
             lit.shapes[_SHAPE_ROWS * i + 3 + k][lane] = ramp[k]
 
 
-def _divide(vpls: Any, count: int) -> Any:
-    """`VplSets` for some of the VPLs, still empty: as many sets as a pixel is spared."""
-    lit = VplSets()
-    blocks = -(-count // LANES)
-    lit.sets = 1
-    while lit.sets < MAX_SETS and blocks >= 2 * lit.sets * BLOCKS_PER_SET:
-        lit.sets *= 2
-    lit.blocks = -(-blocks // lit.sets)
-    lit.vpls, lit.count = vpls, count
-    return lit
-
-
-def arrange(vpls: Any, guide: Guide, launcher: Launcher) -> tuple[Any, Any]:
-    """The `VplSets` of the VPLs on lights and of those on surfaces.
+def arrange(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
+    """The `VplSets` of the VPLs on lights and of those on surfaces: two rows.
 
     The area of the scene's surfaces, the number of VPLs that a pixel weighs and how densely the guide puts them give
-    the bound on G.
+    the bound on G. All that depends on the number of VPLs is left to the device; here there is room for as many as
+    there may be, and what is launched beyond ends at once.
     """
     scene = guide.scene
-    lights, surfaces = _divide(vpls, vpls.on_lights), _divide(vpls, vpls.count - vpls.on_lights)
-    weighed = LANES * max(lights.blocks + surfaces.blocks, 1)
     packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
     # The sort wants room for a second copy.
-    keys = launcher.kept("gather.keys", max(2 * vpls.count, 1), wp.int32)
-    order = launcher.kept("gather.order", max(2 * vpls.count, 1), wp.int32)
-    for lit, name, begin in ((lights, "lights", 0), (surfaces, "surfaces", vpls.on_lights)):
-        lit.bound.least = _INFINITE
-        if scene.area > 0.0:
-            lit.bound.least = math.pi * weighed * guide.density / (_AREAS * scene.area)
-        lit.bound.per_density = math.pi * LANES * lights.blocks / _AREAS
-        lit.order = order[begin:] if lit.count else order
-        blocks = lit.sets * lit.blocks if packed else 0
-        lit.rows = launcher.kept(f"gather.{name}.rows", max(_ROWS * blocks, 1), vec16)
-        lit.colors = launcher.kept(f"gather.{name}.colors", max(LANES * blocks, 1), wp.vec4)
+    keys = launcher.kept("gather.keys", max(2 * vpls.room, 1), wp.int32)
+    order = launcher.kept("gather.order", max(2 * vpls.room, 1), wp.int32)
+    parts = launcher.kept("gather.parts", 2, VplSets)
+    lights, surfaces = VplSets(), VplSets()
+    blocks = []
+    for lit, name, begin, end in (
+        (lights, "lights", 0, vpls.on_lights),
+        (surfaces, "surfaces", vpls.on_lights, vpls.room),
+    ):
+        most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
+        blocks.append(most)
+        lit.vpls, lit.order = vpls, order[begin:] if end > begin else order
+        lit.rows = launcher.kept(f"gather.{name}.rows", max(_ROWS * most, 1), vec16)
+        lit.colors = launcher.kept(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
         lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        lit.shapes = launcher.kept(f"gather.{name}.shapes", max(_SHAPE_ROWS * blocks * lit.shaped, 1), vec16)
-    if vpls.count:
-        launcher.launch(_sort_key, vpls.count, [lights, surfaces, scene.extent, keys, order])
-        wp.utils.radix_sort_pairs(keys, order, vpls.count)
-    if packed:
-        launcher.launch(_pack, lights.sets * lights.blocks + surfaces.sets * surfaces.blocks, [lights, surfaces])
-        if lights.shaped:
-            launcher.launch(_pack_shaping, lights.sets * lights.blocks, [scene.data, lights])
-    return lights, surfaces
+        lit.shapes = launcher.kept(f"gather.{name}.shapes", max(_SHAPE_ROWS * most * lit.shaped, 1), vec16)
+    inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, parts]
+    launcher.launch(_divide, max(vpls.room, 1), inputs)  # where nothing emits, that has to be said, too
+    wp.utils.radix_sort_pairs(keys, order, vpls.room)
+    launcher.launch(_pack, sum(blocks), [parts])
+    if lights.shaped:
+        launcher.launch(_pack_shaping, blocks[0], [scene.data, parts])
+    return parts

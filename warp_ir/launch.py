@@ -17,6 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ir.profiling import Profile
@@ -69,6 +71,8 @@ class Launcher:
             known = ", ".join(str(d) for d in wp.get_devices())
             raise InputError(f"device {device!r} is not available; available: {known}") from error
         self.profile = Profile(self.device)
+        self.waits = self.device.is_cpu
+        """Whether launches are done when they return, so that the host may read what they have written."""
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self._lock = threading.Lock()
@@ -80,6 +84,7 @@ class Launcher:
         self._whole = False
         self._cancelled = threading.Event()
         self._kept: dict[str, Any] = {}
+        self._tables: dict[str, tuple[npt.NDArray[Any], Any]] = {}
 
     def load(self, modules: Sequence[Any]) -> None:
         """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
@@ -268,6 +273,20 @@ class Launcher:
             # Some room, for the number of VPLs differs a little from iteration to iteration.
             array = self._kept[name] = self.empty(rows + rows // 8, dtype)
         return array
+
+    def table(self, name: str, data: npt.NDArray[Any], dtype: Any) -> Any:
+        """Host data on the device, uploaded only when they differ from what `name` was last."""
+        known = self._tables.get(name)
+        if known is None or not np.array_equal(known[0], data):
+            known = self._tables[name] = data, self.array(data, dtype)
+        return known[1]
+
+    def at_most(self, number: Any, limit: int) -> int:
+        """For how many rows to make room and to launch: a number on the device [1], or `limit` if that is less.
+
+        That number itself if it can be had without waiting, else the limit: kernels have to look at the number, too.
+        """
+        return min(int(number.numpy()[0]), limit) if self.waits else limit
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An array of zeros on the device."""

@@ -18,7 +18,8 @@ class Profile:
         self._seconds: dict[str, float] = defaultdict(float)
         self._pending: list[tuple[str, Any, Any]] = []
         self.counts: Counter[str] = Counter()
-        """How often things happened: rays, VPLs, ...; add to it freely."""
+        """How often things happened: rays, light paths, ...; add to it freely."""
+        self._tallies: dict[str, Any] = {}
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -42,11 +43,22 @@ class Profile:
         """Adds time that was measured elsewhere."""
         self._seconds[name] += seconds
 
+    def tally(self, name: str) -> Any:
+        """A count on the device, int64 [1], for kernels to add to."""
+        if name not in self._tallies:
+            self._tallies[name] = wp.zeros(1, dtype=wp.int64, device=self._device)
+        return self._tallies[name]
+
+    def counted(self) -> dict[str, int]:
+        """`counts`, and those on the device. Waits for the GPU's pending work."""
+        return {**self.counts, **{name: int(tally.numpy()[0]) for name, tally in self._tallies.items()}}
+
     def clear(self) -> None:
         """Forgets all of it."""
         self.seconds()
         self._seconds.clear()
         self.counts.clear()
+        self._tallies.clear()
 
     def since(self, before: dict[str, float]) -> Counter[str]:
         """Seconds by phase since `seconds` gave those `before`."""

@@ -206,7 +206,7 @@ class Renderer:
 
     def _tell(self, film: Film) -> None:
         """Adds to a film's timings and counts what has happened since films were told last."""
-        seconds, counts = self.launcher.profile.seconds(), dict(self.launcher.profile.counts)
+        seconds, counts = self.launcher.profile.seconds(), self.launcher.profile.counted()
         for phase in seconds:
             film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._told[0].get(phase, 0.0)
         for what in counts:

@@ -39,16 +39,23 @@ _FOLLOWED_AGAIN = 0.02
 """About the share of the paths that may be longer than what is noted of them."""
 _MOST_NOTED = 2**22
 """Reflections noted at most, 48 bytes each."""
+_ROOM = 8
+"""VPLs on surfaces for which there is room, per path at least: the mean where 8/9 of the light is reflected."""
+_MOST_ROOM = 2**26
+"""VPLs on surfaces at most, 64 bytes each."""
+_THINNING = wp.constant(wp.uint32(0x7FEB352D))  # parts the choice of those that find room from the paths' sequence
 
 
 @wp.struct
 class VplBuffer:
     """VPLs in the scene's device frame, first those on lights, then those on surfaces, path by path.
 
-    Positions and normals are homogeneous, as in `lights`.
+    Positions and normals are homogeneous, as in `lights`. How many there are, the device alone knows: the host would
+    have to wait for it.
     """
 
-    count: int
+    count: wp.array[wp.int32]  # one row
+    room: int  # at least `count`; the same on the CPU, where reading it costs nothing
     on_lights: int
     position: wp.array[wp.vec4]
     normal: wp.array[wp.vec4]
@@ -70,6 +77,7 @@ class PathSettings:
     survivors: wp.array[wp.int32]
     levels: int  # length of survivors
     noted: int  # VPLs of a path that are noted while it is traced
+    room: int  # for VPLs on surfaces; if there are more, some are drawn to stand for all
     aim: Aim
     worth: Worth
 
@@ -81,13 +89,44 @@ def _coin(scramble: wp.uint32, path: int, bounce: int) -> float:
     return sampling.to_unit(bits)
 
 
+@wp.func
+def _row(settings: PathSettings, number: int, total: int) -> int:
+    """The row of VPL `number` of `total` on surfaces; -1: it is dropped, where there is no room for all of them.
+
+    Those that are kept lie evenly among the others, and each is kept with the same probability (systematic sampling).
+    """
+    if total <= settings.room:
+        return settings.on_lights + number
+    offset = sampling.hash_combine(settings.scramble ^ _THINNING, wp.uint32(0)) % wp.uint32(total)
+    before = (wp.int64(number) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
+    after = (wp.int64(number + 1) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
+    return wp.where(after > before, settings.on_lights + int(before), -1)
+
+
+@wp.func
+def _stands_for(settings: PathSettings, total: int) -> float:
+    """How many of `total` VPLs each of those stands for that are kept."""
+    if total <= settings.room:
+        return 1.0
+    return float(total) / float(settings.room)
+
+
 @wp.func(inline=False)
 def _follow(
-    address: wp.uint64, settings: PathSettings, i: int, vpls: VplBuffer, begin: int, step: int, kept: int, most: int
+    address: wp.uint64,
+    settings: PathSettings,
+    i: int,
+    vpls: VplBuffer,
+    number: int,
+    step: int,
+    total: int,
+    kept: int,
+    most: int,
 ) -> int:
     """Follows path `i` and returns how many VPLs it leaves on surfaces.
 
-    Its point on the light goes to row i of `vpls`, VPL j to row `begin` + (j - 1) `step`, if kept < j <= most.
+    Its point on the light goes to row i of `vpls`; the first of the others is VPL `number` of `total`, the next ones
+    follow in steps. VPL j is stored if kept < j <= most.
     """
     scene = scene_at(address)[0]
     u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
@@ -147,11 +186,12 @@ def _follow(
         if survives:
             left += 1
             if left > kept and left <= most:
-                row = begin + (left - 1) * step
-                vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
-                vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-                vpls.intensity[row] = intensity
-                vpls.bounce[row] = bounce
+                row = _row(settings, number + (left - 1) * step, total)
+                if row >= 0:
+                    vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
+                    vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
+                    vpls.intensity[row] = intensity * _stands_for(settings, total)
+                    vpls.bounce[row] = bounce
         origin = hit.position
         u = sampling.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = sampling.to_cosine_hemisphere(u, hit.normal)
@@ -166,15 +206,14 @@ def _trace_paths(
 ) -> None:
     """Follows path `i` and notes its light and its first VPLs on surfaces, those of all paths side by side."""
     i = first + wp.tid()
-    begin = settings.on_lights + i
-    lengths[i] = _follow(scene.address, settings, i, traced, begin, settings.paths, 0, settings.noted)
+    lengths[i] = _follow(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.noted)
 
 
 @wp.func
-def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int) -> None:
+def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, stands_for: float) -> None:
     target.position[to] = source.position[row]
     target.normal[to] = source.normal[row]
-    target.intensity[to] = source.intensity[row]
+    target.intensity[to] = source.intensity[row] * stands_for
     target.bounce[to] = source.bounce[row]
 
 
@@ -187,19 +226,26 @@ def _store_paths(
     lengths: wp.array[wp.int32],
     ends: wp.array[wp.int32],
     vpls: VplBuffer,
+    counted: wp.array[wp.int64],
 ) -> None:
     """Puts path `i` where it belongs: its light in row i, its other VPLs behind those of the paths before it."""
     i = first + wp.tid()
-    begin = settings.on_lights + ends[i] - lengths[i]
+    total = ends[settings.paths - 1]
+    number = ends[i] - lengths[i]
     for k in range(wp.min(lengths[i], settings.noted)):
-        _copy(traced, settings.on_lights + settings.paths * k + i, vpls, begin + k)
+        row = _row(settings, number + k, total)
+        if row >= 0:
+            _copy(traced, settings.on_lights + settings.paths * k + i, vpls, row, _stands_for(settings, total))
     if i < settings.on_lights:
-        _copy(traced, i, vpls, i)
+        _copy(traced, i, vpls, i, 1.0)
         vpls.density[i] = traced.density[i]
         if scene.control_count > 0:
             vpls.control[i] = traced.control[i]
     if lengths[i] > settings.noted:
-        _follow(scene.address, settings, i, vpls, begin, 1, settings.noted, lengths[i])
+        _follow(scene.address, settings, i, vpls, number, 1, total, settings.noted, lengths[i])
+    if i == settings.paths - 1:
+        vpls.count[0] = settings.on_lights + wp.min(total, settings.room)
+        counted[0] += wp.int64(vpls.count[0])
 
 
 def survivors(paths: int, mean_albedo: float) -> npt.NDArray[np.int32]:
@@ -236,7 +282,9 @@ def emit_vpls(
     """
     scene, on_lights = guide.scene, paths
     if not scene.emits:
-        return _buffer(scene, launcher, "vpls", 0, 0)
+        vpls = _buffer(scene, launcher, "vpls", 0, 0)
+        vpls.count.zero_()
+        return vpls
     settings = PathSettings()
     settings.scramble = wp.uint32(scramble)
     paths *= guide.paths
@@ -247,18 +295,20 @@ def emit_vpls(
     if absorption == "fractional":
         alive = survivors(paths, scene.mean_albedo)
         settings.fractional, settings.levels = 1, len(alive)
-        settings.survivors = launcher.array(alive, wp.int32)
-    settings.noted = min(_noted(paths, scene.mean_albedo), settings.max_bounces)
+        settings.survivors = launcher.table("survivors", alive, wp.int32)
+    noted = _noted(paths, scene.mean_albedo)
+    settings.noted = min(noted, max_bounces)
+    settings.room = min(paths * min(max(noted, _ROOM), max_bounces), _MOST_ROOM)
 
     # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
     lengths, ends = launcher.kept("lengths", paths, wp.int32), launcher.kept("ends", paths, wp.int32)
     traced = _buffer(scene, launcher, "traced", on_lights, paths * settings.noted)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
-    vpls = _buffer(scene, launcher, "vpls", on_lights, int(ends[paths - 1 : paths].numpy()[0]))
-    launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls])
+    vpls = _buffer(scene, launcher, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.room))
+    counted = launcher.profile.tally("vpls")
+    launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
-    launcher.profile.counts["vpls"] += vpls.count
     return vpls
 
 
@@ -270,8 +320,9 @@ def _noted(paths: int, mean_albedo: float) -> int:
 
 def _buffer(scene: DeviceScene, launcher: Launcher, name: str, on_lights: int, on_surfaces: int) -> Any:
     vpls = VplBuffer()
-    vpls.on_lights, vpls.count = on_lights, on_lights + on_surfaces
-    rows = max(vpls.count, 1)
+    vpls.on_lights, vpls.room = on_lights, on_lights + on_surfaces
+    vpls.count = launcher.kept(name + ".count", 1, wp.int32)
+    rows = max(vpls.room, 1)
     vpls.position = launcher.kept(name + ".position", rows, wp.vec4)
     vpls.normal = launcher.kept(name + ".normal", rows, wp.vec4)
     vpls.intensity = launcher.kept(name + ".intensity", rows, wp.vec3)
@@ -301,7 +352,7 @@ class Vpls:
 
 def to_host(vpls: Any, scene: DeviceScene) -> Vpls:
     """Copies a `VplBuffer` back to world space."""
-    n = vpls.count
+    n = int(vpls.count.numpy()[0])
     position, normal = vpls.position.numpy()[:n], vpls.normal.numpy()[:n]
     directional = position[:, 3] == 0.0
     area = np.where(directional, 1.0, scene.frame.scale**-2.0)[:, None]

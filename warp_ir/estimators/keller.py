@@ -68,7 +68,7 @@ def _accumulate(
     from_surfaces = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         position = gbuffer.position[pixel]
-        for k in range(vpls.count):
+        for k in range(vpls.count[0]):
             g = geometry_term(
                 position, gbuffer.normal[pixel], gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k]
             )

@@ -19,7 +19,7 @@ import warp as wp
 import warp_ir.pilot.probes
 from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.gather import Receiver, VplSets, arrange, gather
+from warp_ir.gather import ON_LIGHTS, ON_SURFACES, Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.guide import Guide, unguided
 from warp_ir.launch import Launcher
@@ -87,8 +87,7 @@ def _gather_pixels(
     first: int,
     scene: SceneData,
     gbuffer: GBuffer,
-    lights: VplSets,
-    surfaces: VplSets,
+    parts: wp.array[VplSets],
     settings: GatherSettings,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
@@ -105,14 +104,15 @@ def _gather_pixels(
         which = sampling.sample_1d(scene.sobol, index, 0, settings.scramble)
         x = _first_receiver(gbuffer, pixel)
         throughput = wp.vec3(1.0)
-        reach = 1.0 / wp.sqrt(lights.bound.least)
+        bound = parts[ON_LIGHTS].bound  # the same for both
+        reach = 1.0 / wp.sqrt(bound.least)
         depth = int(0)
         rays = settings.rays
         while depth <= settings.max_bounces:
             u = sampling.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
             bounces = settings.max_bounces - depth
-            by_lights = gather(scene, lights, which, x, u[0], rays[0], bounces)
-            by_surfaces = gather(scene, surfaces, which, x, u[1], rays[1], bounces)
+            by_lights = gather(scene, parts, ON_LIGHTS, which, x, u[0], rays[0], bounces)
+            by_surfaces = gather(scene, parts, ON_SURFACES, which, x, u[1], rays[1], bounces)
             if depth == 0:
                 once = by_lights
                 more = by_surfaces
@@ -126,13 +126,13 @@ def _gather_pixels(
             cosine = wp.dot(direction, x.shading_normal)
             hit = closest(scene, x.position, direction, reach)
             near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = lights_beyond(scene, x.position, direction, near, cosine, lights.bound, reach, x.mesh, x.seen)
+            found = lights_beyond(scene, x.position, direction, near, cosine, bound, reach, x.mesh, x.seen)
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-                cut = cut_share(lights.bound.least, g)
+                cut = cut_share(bound.least, g)
                 if cut > 0.0:
-                    found += surface_beyond(scene, hit, direction, g, lights.bound, x.mesh)
+                    found += surface_beyond(scene, hit, direction, g, bound, x.mesh)
             found = wp.cw_mul(throughput, found) * wp.pi
             if depth == 0:
                 once += found
@@ -187,7 +187,7 @@ class VplGatherer:
                 max_bounces=settings.bounce_limit,
                 scramble=scramble,
             )
-            lights, surfaces = arrange(vpls, guide, launcher)
+            parts = arrange(vpls, guide, launcher)
         how = GatherSettings()
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
@@ -197,7 +197,7 @@ class VplGatherer:
             launcher.launch(
                 _gather_pixels,
                 indices(gbuffer.tiles),
-                [guide.scene.data, gbuffer, lights, surfaces, how, direct, indirect],
+                [guide.scene.data, gbuffer, parts, how, direct, indirect],
             )
 
     def _guide_of(self, iteration: int) -> Guide:

@@ -239,7 +239,7 @@ def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, setti
         max_bounces=settings.bounce_limit,
         scramble=sampling.iteration_scramble(settings.seed, _LIGHT_PATHS),
     )
-    on_surfaces = vpls.count - vpls.on_lights
+    on_surfaces = int(vpls.count.numpy()[0]) - vpls.on_lights
     n = min(on_surfaces, _VPLS_PER_PATH * paths)
     extent = 2.0 * float(scene.data.radius)
     cells, gives = launcher.empty(max(n, 1), wp.int32), launcher.empty(max(n, 1) * _CONNECTIONS, wp.float32)
