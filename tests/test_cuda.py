@@ -16,14 +16,16 @@ import warp_ir.estimators.vpl
 import warp_ir.vpl
 from tests.physics.test_invariance import room
 from warp_ir.device_scene import SceneData
+from warp_ir.launch import MOST_REGISTERS
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
 
 wp.set_module_options({"enable_backward": False})
 
 _REGISTERS, _FRAME = 0x2F, 0x11  # EIATTR_REGCOUNT, EIATTR_FRAME_SIZE
-_MOST_REGISTERS = 128
+_MOST_REGISTERS = 128  # let a multiprocessor hold 512 threads
 _MOST_LOCAL = 128  # an array of a few boxes, which a loop indexes
+_MOST_LOCAL_OF_RAYS = 2048  # the stacks of Warp's queries of trees, and what functions keep while they call others
 PACKAGE = Path(ir.__file__).parent
 KERNEL_MODULES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))
@@ -57,12 +59,11 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
     traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
     for name, (registers, local) in used.items():
         if traces_rays and local > _MOST_LOCAL:
-            # Calls use the stack, Warp's queries of trees have one of 32 entries each, and 255 registers spill. But
-            # what is as large as the scene's record is a copy of it, or the stack of the CPU's traversal.
-            assert local < ctypes.sizeof(SceneData.ctype), f"{name}: {local} bytes of local memory"
+            assert registers <= MOST_REGISTERS, f"{name}: {registers} registers"
+            # A copy of the scene's record, or the stack of the CPU's traversal, does not fit.
+            assert local <= _MOST_LOCAL_OF_RAYS < ctypes.sizeof(SceneData.ctype), f"{name}: {local} bytes"
         else:
-            # 128 registers let a multiprocessor hold 512 threads.
-            assert registers <= _MOST_REGISTERS or traces_rays, f"{name}: {registers} registers"
+            assert registers <= _MOST_REGISTERS, f"{name}: {registers} registers"
             assert local <= _MOST_LOCAL, f"{name}: {local} bytes of local memory"
 
 
@@ -113,6 +114,12 @@ def resources(cubin):
             found.setdefault(text(name, sections[".strtab"]), {})[attribute] = value
         place += length
     return {k: (v[_REGISTERS], v.get(_FRAME, 0)) for k, v in found.items() if _REGISTERS in v and "$" not in k}
+
+
+def test_chosen_vpls_have_room():
+    """A thread without lanes keeps the VPLs it has chosen in an array of eight."""
+    how = warp_ir.estimators.vpl
+    assert max(*how._SHADOW_RAYS, *how._SHADOW_RAYS_AFTER) <= warp_ir.gather._MOST_RAYS
 
 
 READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")

@@ -35,6 +35,7 @@ _BLOCKS_PER_SET = wp.constant(16)
 """A pixel weighs about 16 x 16 VPLs: a fraction of the cost of the shadow rays that follow."""
 _MAX_SETS = wp.constant(64)
 _PI = wp.constant(wp.float64(math.pi))
+_MOST_RAYS = wp.constant(8)
 _UNBOUNDED = wp.constant(3.0e38)
 _LAST = wp.constant(2**31 - 1)
 _AREAS = wp.constant(wp.float64(20.0))
@@ -230,7 +231,7 @@ def gather(
     """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
 
     `part` is `ON_LIGHTS` or `ON_SURFACES`. `which` in [0, 1) chooses the set, `u` in [0, 1) is the offset of the
-    systematic choice of VPLs. Those of more than `max_bounce` reflections are dark.
+    systematic choice of VPLs. Those of more than `max_bounce` reflections are dark. `rays` is 8 at most.
     """
     return _gather(scene.address, parts, part, which, x, u, rays, max_bounce)
 
@@ -313,7 +314,10 @@ def _count_in_lane(lit: VplSets, begin: int, lane: int, x: Receiver, target: flo
 def _gather_one_by_one(
     scene: SceneData, lit: VplSets, chosen: int, x: Receiver, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
-    """The same for a thread without lanes: one running sum, M targets along it."""
+    """The same for a thread without lanes: one running sum, M targets along it.
+
+    Rays are sent afterwards: what the sums need would have to be kept in registers meanwhile.
+    """
     out = wp.vec3(0.0)
     begin = chosen * lit.blocks * _LANES
     end = wp.min(begin + lit.blocks * _LANES, lit.count)
@@ -325,12 +329,16 @@ def _gather_one_by_one(
     share = total / float(rays)
     running = float(0.0)
     drawn = int(0)
+    slots = wp.zeros(shape=_MOST_RAYS, dtype=wp.int32)
     for slot in range(begin, end):
         running += _weigh_one(scene, lit, x, slot)
         while drawn < rays and (float(drawn) + u) * share < running:
-            position = lit.vpls.position[lit.order[slot]]
-            out += _shadowed(scene, lit, x, slot, position, _color_of(lit, slot), share, max_bounce)
+            slots[drawn] = slot
             drawn += 1
+    for k in range(drawn):
+        slot = slots[k]
+        position = lit.vpls.position[lit.order[slot]]
+        out += _shadowed(scene, lit, x, slot, position, _color_of(lit, slot), share, max_bounce)
     return out
 
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.launch import Launcher, carve, floats
+from warp_ir.launch import MOST_REGISTERS, Launcher, carve, floats
 from warp_ir.lights import lights_found, surface_seen
 from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, smooth_rise
 from warp_ir.tiles import Tiles, all_tiles, indices, missed_at, pixel_at
@@ -200,7 +200,7 @@ def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int,
     return sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
 ) -> None:

@@ -31,6 +31,10 @@ _MOST_BANDS = 64
 _LEAST_SECONDS = 1.0e-4
 """What a band should take at least: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
+MOST_REGISTERS = 168
+"""Of a CUDA thread, in kernels that trace rays. Left alone they take 255, and a multiprocessor has room for 256 threads
+to hide each other's waiting; so it has for 384. What does not fit is kept in memory, mostly by callers while rays are
+followed. The number is what Blender's Cycles uses (kernel/device/cuda/config.h); here it has not been measured yet."""
 
 
 class Cancelled(Exception):

@@ -158,13 +158,14 @@ def _meet(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float,
 
 
 @wp.func
-def _nearest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+def _nearest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest triangle along a ray, open or not."""
     hit = Hit()
     hit.triangle = -1
     hit.instance = -1
-    found = _meet(scene.address, origin, direction, t_max, False)
+    found = _meet(address, origin, direction, t_max, False)
     if found.triangle >= 0:
+        scene = scene_at(address)[0]
         hit.triangle = found.triangle
         hit.instance = found.instance
         hit.t = found.t
@@ -198,16 +199,16 @@ def _way(origin: wp.vec3, target: wp.vec4) -> wp.vec3:
 @wp.func(inline=False)
 def _nearest_present(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max: float) -> Hit:
     """The nearest triangle on the way to a homogeneous point that is there where the ray meets it."""
-    scene = scene_at(address)[0]
     along = _way(origin, target)
     start = origin
     passed = float(0.0)
     for _layer in range(_MOST_LAYERS):
         # Every step off a surface moves the ray a little: it is aimed anew, or not only the last surface would end it.
         way = _way(start, target)
-        hit = _nearest(scene, start, way, wp.where(target[3] == 0.0, t_max - passed, t_max))
+        hit = _nearest(address, start, way, wp.where(target[3] == 0.0, t_max - passed, t_max))
         if hit.triangle < 0:
             return hit
+        scene = scene_at(address)[0]
         if not _is_open(scene, hit.triangle, hit.u, hit.v):
             hit.t += passed
             return hit
@@ -227,7 +228,7 @@ def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float)
     if scene.open_count > 0:
         target = wp.vec4(direction[0], direction[1], direction[2], 0.0)
         return _nearest_present(scene.address, origin, target, t_max)
-    return _nearest(scene, origin, direction, t_max)
+    return _nearest(scene.address, origin, direction, t_max)
 
 
 @wp.func

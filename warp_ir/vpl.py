@@ -20,7 +20,7 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.guide import Guide, Worth, kept_probability
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import Aim, emit, land, sample_light
 from warp_ir.surface import albedo, closest, scene_at
 
@@ -200,7 +200,7 @@ def _follow(
     return left
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _trace_paths(
     first: int, scene: SceneData, settings: PathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
 ) -> None:
@@ -217,7 +217,7 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, stands_for: f
     target.bounce[to] = source.bounce[row]
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _store_paths(
     first: int,
     scene: SceneData,

@@ -23,7 +23,7 @@ import warp as wp
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.guide import unguided
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import arriving
 from warp_ir.sampling import iteration_scramble
 from warp_ir.settings import RenderSettings
@@ -50,7 +50,7 @@ def geometry_term(
     return at_point * at_vpl / squared
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _accumulate(
     first: int,
     scene: SceneData,

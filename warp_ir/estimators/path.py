@@ -15,7 +15,7 @@ import warp as wp
 from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sample_arrival, surface_found
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
@@ -51,7 +51,7 @@ def _reflected(
     return wp.cw_mul(light.radiance, arrives) * (weight * by_bsdf)
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _trace_paths(
     first: int,
     scene: SceneData,

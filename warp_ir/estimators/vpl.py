@@ -22,7 +22,7 @@ from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gather import ON_LIGHTS, ON_SURFACES, Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.guide import Guide, unguided
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import cut_share, lights_beyond, surface_beyond
 from warp_ir.pilot import can_pay, learn
 from warp_ir.settings import RenderSettings
@@ -82,7 +82,7 @@ def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
     return x
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _gather_pixels(
     first: int,
     scene: SceneData,

@@ -11,7 +11,7 @@ from warp_ir import sampling
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import camera_ray, see
 from warp_ir.guide import CELLS, Guide, cell_of
-from warp_ir.launch import Launcher, copied
+from warp_ir.launch import MOST_REGISTERS, Launcher, copied
 from warp_ir.lights import arriving, choose_emitter, sample_arrival
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest, visible
@@ -56,7 +56,7 @@ class _Rows:
     tile: wp.array[wp.int32]  # of the path
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _look(first: int, scene: SceneData, camera: CameraData, scramble: wp.uint32, found: _Rows) -> None:
     """Follows camera path `i`."""
     i = first + wp.tid()
@@ -178,7 +178,7 @@ def _finite(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     return np.where(np.isfinite(values), values, np.float32(0.0)).astype(np.float64)
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _connect(
     first: int,
     scene: SceneData,

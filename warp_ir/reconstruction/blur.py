@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_ir.film import FilmData
 from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, project, see
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
 from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
@@ -164,7 +164,7 @@ def _look_through(
     return mean
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MOST_REGISTERS)
 def _compose(
     first: int, blur: Blur, seen: Observations, layer: Layer, film: FilmData, exposure: float, out: Picture
 ) -> None:

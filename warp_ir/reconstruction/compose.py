@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film import FilmData, emission_of
-from warp_ir.launch import Launcher
+from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.reconstruction.edges import Lit, Pixel, look_closely, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
 from warp_ir.reconstruction.observations import Observations
@@ -114,7 +114,7 @@ def show(out: Picture, p: int, x: Shown) -> None:
     out.rows[1, p] = x.indirect
 
 
-@wp.kernel(module="warp_ir.gbuffer")  # so that camera rays are compiled once
+@wp.kernel(module="warp_ir.gbuffer", cuda_max_registers=MOST_REGISTERS)  # so that camera rays are compiled once
 def _compose(
     first: int,
     scene: SceneData,
