@@ -123,6 +123,7 @@ def test_chosen_vpls_have_room():
 
 
 READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")
+WAITS = ("synchronize", "synchronize_stream", "synchronize_event", "get_event_elapsed_time")
 
 
 @pytest.mark.parametrize(
@@ -149,9 +150,10 @@ def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
     renderer = Renderer(scene, settings)
     renderer.launcher.waits = False
     film = renderer.new_film()
-    with blind(monkeypatch):
+    with blind(monkeypatch) as waits:
         for iteration in range(3):
             renderer.add_iteration(film, iteration)
+            assert len(waits) == iteration + 1  # when it is done
     renderer._tell(film)
     np.testing.assert_array_equal(film.radiance(), expected.radiance())
     assert film.counts == expected.counts
@@ -184,19 +186,22 @@ def test_guided_iterations_read_nothing_back(name, monkeypatch):
 def test_reading_is_noticed(monkeypatch):
     """Where nothing may be read, every way to read fails, and so does an iteration that counts its VPLs."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=8, height=8, light_paths=8))
-    array = renderer.launcher.zeros(1, wp.int32)
+    array, film = renderer.launcher.zeros(1, wp.int32), renderer.new_film()
     with blind(monkeypatch):
         for read in (array.numpy, array.list, lambda: array.to("cpu"), lambda: np.asarray(array), lambda: str(array)):
             with pytest.raises(AssertionError, match="read back"):
                 read()
         with pytest.raises(AssertionError, match="read back"):
-            renderer.add_iteration(renderer.new_film(), 0)
+            wp.synchronize()
+        with pytest.raises(AssertionError, match="read back"):
+            renderer.add_iteration(film, 0)
     assert array.numpy().tolist() == [0]
 
 
 @contextmanager
 def blind(monkeypatch):
-    """Lets nothing be read from an array on a device while it lasts."""
+    """Lets nothing be read from an array while it lasts, nor be waited for but a whole device: when, it tells."""
+    waits = []
 
     def fail(*_, **__):
         raise AssertionError("read back")
@@ -205,7 +210,10 @@ def blind(monkeypatch):
         for name in READS:
             is_property = isinstance(getattr(wp.array, name), property)
             context.setattr(wp.array, name, property(fail) if is_property else fail)
-        yield
+        for name in WAITS:
+            context.setattr(wp, name, fail)
+        context.setattr(wp, "synchronize_device", waits.append)
+        yield waits
 
 
 def test_only_the_launcher_knows_the_device():
