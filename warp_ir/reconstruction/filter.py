@@ -11,14 +11,15 @@ from typing import Any
 import warp as wp
 
 from warp_ir.launch import Launcher
-from warp_ir.reconstruction.surfaces import Surfaces, same_surface
+from warp_ir.reconstruction.surfaces import Surfaces, fits
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-LEVELS = 5
-"""Passes; their taps lie 1, 2, 4, ... pixels apart."""
-_SIGMA = 7.0
-"""Standard errors by which two estimates of one value may well differ, in the first pass ..."""
+LEVELS = 4
+"""Passes; their taps lie 1, 2, 4, ... pixels apart. In a fifth next to nothing would be alike."""
+_SIGMAS = (5.5, 7.5)
+"""Standard errors by which two estimates of one value may well differ, in the first pass: fewer in direct light, whose
+shadows are sharp ..."""
 _NARROW = 0.45
 """... and its factor from pass to pass: what is left then is smooth, and differences farther apart are real."""
 
@@ -64,7 +65,7 @@ def _alike(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
 
 
 @wp.kernel
-def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int, sigma: float) -> None:
+def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int, sigmas: wp.vec2) -> None:
     """One pass of 3 x 3 taps, `step` pixels apart."""
     p = first + wp.tid()
     here = source.direct[p]
@@ -91,12 +92,12 @@ def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, ste
                         a = w
                         b = w
                         if q != p:
-                            w *= same_surface(surfaces, q, position, normal)
-                            a = w
-                            b = w
+                            fit = fits(surfaces, q, position, normal)
+                            a = w * fit[0]
+                            b = w * fit[1]
                             if known:
-                                a *= _alike(here, d, sigma)
-                                b *= _alike(there, i, sigma)
+                                a *= _alike(here, d, sigmas[0])
+                                b *= _alike(there, i, sigmas[1])
                         direct += wp.vec4(d[0] * a, d[1] * a, d[2] * a, d[3] * a * a)
                         indirect += wp.vec4(i[0] * b, i[1] * b, i[2] * b, i[3] * b * b)
                         weights += wp.vec2(a, b)
@@ -123,6 +124,7 @@ def filter_layer(surfaces: Any, layer: Any, other: Any, launcher: Launcher) -> t
     """The filtered `Layer`, and one to be overwritten: both given ones are used up."""
     pixels = surfaces.columns * surfaces.rows
     for level in range(LEVELS):
-        launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level, _SIGMA * _NARROW**level])
+        sigmas = wp.vec2(*(sigma * _NARROW**level for sigma in _SIGMAS))
+        launcher.launch(_filter_level, pixels, [surfaces, layer, other, 1 << level, sigmas])
         layer, other = other, layer
     return layer, other

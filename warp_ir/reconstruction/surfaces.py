@@ -28,18 +28,28 @@ def _window(x: float) -> float:
 
 
 @wp.func
-def same_surface(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
-    """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0."""
+def fits(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
+    """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0.
+
+    Then the same for light from all around, which changes less as a surface turns.
+    """
     footprint = surfaces.footprint[p]
     if footprint <= 0.0:
-        return 0.0
-    facing = wp.max(wp.dot(surfaces.normal[p], normal), 0.0)
-    facing *= facing
+        return wp.vec2(0.0)
+    there = surfaces.normal[p]
+    facing = wp.max(wp.dot(there, normal), 0.0)
     facing *= facing
     facing *= facing
     apart = position - surfaces.position[p]
-    off = wp.max(wp.abs(wp.dot(surfaces.normal[p], apart)), wp.abs(wp.dot(normal, apart)))
-    return facing * facing * _window(off / (_PLANE * footprint))
+    off = wp.max(wp.abs(wp.dot(there, apart)), wp.abs(wp.dot(normal, apart)))
+    wide = facing * _window(off / (_PLANE * footprint))
+    return wp.vec2(wide * facing * facing * facing, wide)
+
+
+@wp.func
+def same_surface(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
+    """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0."""
+    return fits(surfaces, p, position, normal)[0]
 
 
 @wp.func
