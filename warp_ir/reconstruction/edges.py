@@ -7,7 +7,7 @@ from warp_ir.film import FilmData, emission_of
 from warp_ir.gbuffer import Sight, camera_ray, jitter, see
 from warp_ir.reconstruction.filter import Layer, mean_channel, value
 from warp_ir.reconstruction.observations import Observations
-from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface
+from warp_ir.reconstruction.surfaces import MATCH, Surfaces, pixel_around, same_surface
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -17,13 +17,16 @@ _PROBES = wp.constant(8)  # rays, to see whether the edge is in the pixel
 @wp.func
 def on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
     """Whether any of the eight neighbours shows another surface, or none, or one that emits differently."""
+    if surfaces.bordering[p] == wp.uint8(1):
+        return True
+    if film.emission.shape[0] == 0:
+        return False
     here = emission_of(film, p)
     glow = here[0] + here[1] + here[2]
     for k in range(9):
-        q = pixel_around(surfaces, p, k)
-        there = emission_of(film, q)
+        there = emission_of(film, pixel_around(surfaces, p, k))
         other = there[0] + there[1] + there[2]
-        if wp.abs(other - glow) > 0.01 * wp.max(other, glow) or differ(surfaces, p, q):
+        if wp.abs(other - glow) > 0.01 * wp.max(other, glow):
             return True
     return False
 

@@ -46,13 +46,13 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
 
 
 @wp.kernel
-def _find_edges(first: int, surfaces: Surfaces, out: wp.array[wp.int32]) -> None:
-    """1 where any of the eight neighbours shows something else."""
+def _find_edges(first: int, surfaces: Surfaces) -> None:
+    """Notes where any of the eight neighbours shows something else."""
     p = first + wp.tid()
-    out[p] = 0
+    surfaces.bordering[p] = wp.uint8(0)
     for k in range(9):
         if differ(surfaces, p, pixel_around(surfaces, p, k)):
-            out[p] = 1
+            surfaces.bordering[p] = wp.uint8(1)
 
 
 @wp.func
@@ -172,9 +172,10 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed
     surfaces.columns, surfaces.rows = camera.columns, camera.rows
     surfaces.position, surfaces.normal = launcher.zeros(pixels, wp.vec3), launcher.zeros(pixels, wp.vec3)
     surfaces.footprint = launcher.empty(pixels, wp.float32)
+    surfaces.bordering = launcher.empty(pixels, wp.uint8)
     trace_primary(scene, camera, launcher, gbuffer, iteration=-1, seed=0)
     launcher.launch(_look, pixels, [camera, gbuffer, surfaces])
-    launcher.launch(_find_edges, pixels, [surfaces, gbuffer.mesh])
+    launcher.launch(_find_edges, pixels, [surfaces])
     seen = Observations()
     seen.surfaces = surfaces
     for name in ("direct", "indirect", "other_direct", "other_indirect"):
@@ -182,7 +183,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed
     seen.squares = launcher.zeros(pixels, wp.vec2)
     seen.count, seen.other_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
     seen.seed = wp.uint32(seed)
-    return seen, float(gbuffer.mesh.numpy().mean())
+    return seen, float(surfaces.bordering.numpy().mean())
 
 
 def sums(seen: Any) -> dict[str, Any]:

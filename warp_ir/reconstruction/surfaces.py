@@ -18,6 +18,7 @@ class Surfaces:
     position: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]  # unit
     footprint: wp.array[wp.float32]  # size of a pixel there; 0: background
+    bordering: wp.array[wp.uint8]  # 1: any of the eight neighbours shows another surface, or none
 
 
 @wp.func
