@@ -120,14 +120,15 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
                 q = y * surfaces.columns + x
                 if seen.count[q] > 0:
                     w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
-                    sums = w * mean_channels(seen.direct[q], seen.indirect[q])
-                    w_free = w * float(seen.count[q] - 1)
-                    spread += w * _spread(seen, q)
-                    around += sums * (float(seen.count[q] - 1) / float(seen.count[q]))
-                    weights += w_free
-                    firsts += sums
-                    squares += w * seen.squares[q]
-                    samples += w * float(seen.count[q])
+                    if w > 0.0:
+                        sums = w * mean_channels(seen.direct[q], seen.indirect[q])
+                        firsts += sums
+                        squares += w * seen.squares[q]
+                        samples += w * float(seen.count[q])
+                        if seen.count[q] > 1:
+                            spread += w * _spread(seen, q)
+                            around += sums * (float(seen.count[q] - 1) / float(seen.count[q]))
+                            weights += w * float(seen.count[q] - 1)
     n = float(seen.count[p])
     out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     out.indirect[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
