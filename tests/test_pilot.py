@@ -203,7 +203,7 @@ def test_both_halves_of_the_pilot_see_the_picture():
     camera = renderer._moments[0].camera
     seen = look(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
     middle = np.median(seen.position[seen.bounce == 0, :2], axis=0)
-    for half in (seen.early, ~seen.early):
+    for half in (seen.even, ~seen.even):
         beyond = (seen.position[half & (seen.bounce == 0), :2] > middle).mean(axis=0)
         assert np.all(np.abs(beyond - 0.5) < 0.05)
 

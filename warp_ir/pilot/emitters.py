@@ -26,8 +26,8 @@ def choose_emitters(scene: DeviceScene, seen: Sightings, launcher: Launcher) -> 
         return None
     power = np.diff(scene.data.emitter_cdf.numpy().astype(np.float64))
     power = np.maximum(power, np.finfo(np.float32).tiny)  # too weak for a float, and never chosen
-    learned = probabilities(power, seen.emitter[seen.early], seen.score[seen.early])
-    emitter, squares = seen.emitter[~seen.early], seen.score[~seen.early] ** 2
+    learned = probabilities(power, seen.emitter[seen.even], seen.score[seen.even])
+    emitter, squares = seen.emitter[~seen.even], seen.score[~seen.even] ** 2
     if squares.sum() <= WORTH * (squares * (power / learned)[emitter]).sum():
         return None
     return _rechosen(scene, power, probabilities(power, seen.emitter, seen.score), launcher)

@@ -1,5 +1,6 @@
 """The pilot's rays: paths from the camera that ask for light, and VPLs that are connected with what the camera sees."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,8 +9,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir import sampling
-from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import camera_ray, see
+from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
 from warp_ir.guide import CELLS, Guide, cell_of
 from warp_ir.launch import MOST_REGISTERS, Launcher, copied
 from warp_ir.lights import arriving, choose_emitter, sample_arrival
@@ -26,7 +27,7 @@ _ASKED = 4
 """Emitters, at each of them."""
 _ASKED_COUNT = wp.constant(_ASKED)
 _ROWS = wp.constant(_VERTICES * _ASKED)
-_FIRST_DIMENSION = wp.constant(4)  # 0-1: place in the image, 2-3: on the lens
+_FIRST_DIMENSION = wp.constant(4)  # those before are the camera's
 _DIMENSIONS = wp.constant(6)  # of the sequence, per vertex
 _CONNECTIONS = 4
 """Of each VPL with points that the camera sees."""
@@ -38,7 +39,6 @@ _CAMERA_PATHS, _LIGHT_PATHS = 1 << 32, (1 << 32) + 1
 """Numbers of iterations that no render has, for the scrambles."""
 _TILES = 8
 """Of the image along each edge: noise counts relative to the brightness of its tile."""
-_TILE_COUNT = wp.constant(_TILES)
 _MOST = 16.0
 """No sample counts for more than as many times the mean, so that none decides alone."""
 
@@ -53,29 +53,21 @@ class _Rows:
     normal: wp.array[wp.vec3]
     target: wp.array[wp.vec4]  # the emitter's point, homogeneous
     weight: wp.array[wp.float32]  # what irradiance here gives to the pixel
-    tile: wp.array[wp.int32]  # of the path
 
 
 @wp.kernel(cuda_max_registers=MOST_REGISTERS)
-def _look(first: int, scene: SceneData, camera: CameraData, scramble: wp.uint32, found: _Rows) -> None:
-    """Follows camera path `i`."""
+def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, found: _Rows) -> None:
+    """Follows camera path `i` from what the camera sees on."""
     i = first + wp.tid()
     for row in range(i * _ROWS, (i + 1) * _ROWS):
         found.emitter[row] = -1
         found.score[row] = 0.0
         found.weight[row] = 0.0
-    film = sampling.sample_2d(scene.sobol, i, 0, scramble)
-    found.tile[i] = int(film[1] * float(_TILE_COUNT)) * _TILE_COUNT + int(film[0] * float(_TILE_COUNT))
-    x = film[0] * float(camera.columns)
-    y = film[1] * float(camera.rows)
-    pixel = wp.min(int(y), camera.rows - 1) * camera.columns + wp.min(int(x), camera.columns - 1)
-    lens = sampling.to_disk(sampling.sample_2d(scene.sobol, i, 2, scramble))
-    sight = see(scene, camera, camera_ray(camera, pixel, wp.vec2(wp.frac(x), wp.frac(y)), lens))
-    position = sight.position
-    normal = sight.normal
-    shading_normal = sight.shading_normal
-    throughput = sight.albedo
-    mesh = sight.mesh
+    position = gbuffer.position[i]
+    normal = gbuffer.normal[i]
+    shading_normal = gbuffer.shading_normal[i]
+    throughput = gbuffer.albedo[i]
+    mesh = gbuffer.mesh[i]
     k = int(0)
     while k < _VERTEX_COUNT and mesh >= 0 and wp.max(throughput) > 0.0:
         dimension = _FIRST_DIMENSION + _DIMENSIONS * k
@@ -117,8 +109,8 @@ def _look(first: int, scene: SceneData, camera: CameraData, scramble: wp.uint32,
 class Sightings:
     """The vertices of the camera paths, without those that were not there."""
 
-    early: npt.NDArray[np.bool_]
-    """[n], whether the path is one of the first half."""
+    even: npt.NDArray[np.bool_]
+    """[n], whether the path has an even number: half of them, from all over the image."""
     bounce: npt.NDArray[np.int64]
     """[n], reflections of the light before it comes to the vertex."""
     emitter: npt.NDArray[np.int64]
@@ -134,23 +126,30 @@ class Sightings:
 
 
 def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: RenderSettings) -> Sightings:
-    """Sends paths from all over the image."""
+    """Sends about so many paths from all over the image."""
     whole = copied(camera)
-    whole.columns, whole.rows, whole.first_column, whole.first_row = camera.image_columns, camera.image_rows, 0, 0
+    # As many pixels as there are paths, and nothing but surfaces.
+    whole.rows = min(max(round(math.sqrt(paths * camera.image_rows / camera.image_columns)), 1), paths)
+    whole.columns = paths // whole.rows
+    whole.image_columns, whole.image_rows, whole.first_column, whole.first_row = whole.columns, whole.rows, 0, 0
+    whole.shows_lights = 0
+    paths = whole.columns * whole.rows
+    scramble = sampling.iteration_scramble(settings.seed, _CAMERA_PATHS)
+    gbuffer, *_ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
+    trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
     n = paths * _VERTICES * _ASKED
     rows = _Rows()
     for name, dtype in (("emitter", wp.int32), ("score", wp.float32), ("position", wp.vec3), ("normal", wp.vec3)):
         setattr(rows, name, launcher.empty(n, dtype))
     rows.target, rows.weight = launcher.empty(n, wp.vec4), launcher.empty(n, wp.float32)
-    rows.tile = launcher.empty(paths, wp.int32)
-    scramble = sampling.iteration_scramble(settings.seed, _CAMERA_PATHS)
-    launcher.launch(_look, paths, [scene.data, whole, wp.uint32(scramble), rows])
+    launcher.launch(_look, paths, [scene.data, gbuffer, wp.uint32(scramble), rows])
 
     emitter, score = rows.emitter.numpy(), _finite(rows.score.numpy())
     bounce = np.arange(n) // _ASKED % _VERTICES
     there = (emitter >= 0) & (bounce <= settings.bounce_limit)
     score[~there] = 0.0
-    tile = rows.tile.numpy()
+    row, column = np.divmod(np.arange(paths), whole.columns)
+    tile = row * _TILES // whole.rows * _TILES + column * _TILES // whole.columns
     sums = np.bincount(tile, score.reshape(paths, -1).sum(axis=1) / _ASKED, _TILES**2)
     brightness = sums / np.maximum(np.bincount(tile, minlength=_TILES**2), 1)
     scale = np.repeat(np.sqrt(brightness**2 + 0.01 * brightness.mean() ** 2)[tile], _VERTICES * _ASKED)
@@ -158,8 +157,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
         score /= scale
         rows.weight = launcher.array(rows.weight.numpy() / scale, wp.float32)
     return Sightings(
-        # Runs of the sequence: its points of even number would all be in one half of the image.
-        early=(np.arange(n) < n // 2)[there],
+        even=(np.arange(n) // (_VERTICES * _ASKED) % 2 == 0)[there],
         bounce=bounce[there],
         emitter=emitter[there].astype(np.int64),
         score=clipped(score[there]),

@@ -39,14 +39,14 @@ def aim_at_foci(scene: DeviceScene, seen: Sightings, launcher: Launcher) -> Any 
         mine = (seen.emitter == emitter) & (seen.bounce > 0) & (seen.score > 0.0)
         if not mine.any():
             continue
-        points, ways, score, early = seen.position[mine], seen.target[mine, :3], seen.score[mine], seen.early[mine]
+        points, ways, score, even = seen.position[mine], seen.target[mine, :3], seen.score[mine], seen.even[mine]
         place = nearest_point(points, ways, score)
         outer = radius + float(np.linalg.norm(place - centre))  # which covers the scene
         halvings = -np.log2(np.maximum(_apart(points, ways, place) / outer, 2.0**-_RINGS))
         ring = _RINGS - 1 - np.clip(halvings, 0, _RINGS - 1).astype(np.int64)
-        learned = _shares(ring[early], score[early])
-        before += score[~early].sum() * (radius / outer) ** 2
-        after += (score * (_AREAS / learned)[ring])[~early].sum()
+        learned = _shares(ring[even], score[even])
+        before += score[~even].sum() * (radius / outer) ** 2
+        after += (score * (_AREAS / learned)[ring])[~even].sum()
         focus[item[emitter]] = *place, outer
         cdf[item[emitter]] = np.cumsum(_shares(ring, score))
     if before <= WORTH * after:
