@@ -4,6 +4,7 @@ import ast
 import ctypes
 import importlib
 import struct
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,11 +28,24 @@ _MOST_REGISTERS = 128  # let a multiprocessor hold 512 threads
 _MOST_LOCAL = 128  # an array of a few boxes, which a loop indexes
 _MOST_LOCAL_OF_RAYS = 2048  # the stacks of Warp's queries of trees, and what functions keep while they call others
 PACKAGE = Path(ir.__file__).parent
-KERNEL_MODULES = [
+KERNEL_FILES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))
     for path in sorted(PACKAGE.rglob("*.py"))
     if "@wp.kernel" in path.read_text()
 ]
+
+
+def compiled_with(module):
+    """For every kernel in a file, the module that it is compiled with: its own, unless the decorator names another."""
+    for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
+        for decorator in getattr(node, "decorator_list", ()):
+            if "wp.kernel" in ast.unparse(decorator):
+                named = {k.arg: k.value for k in getattr(decorator, "keywords", ())}
+                yield named["module"].value if "module" in named else module.__name__
+
+
+KERNELS = Counter(name for file in KERNEL_FILES for name in compiled_with(file))
+"""How many there are in a module."""
 
 
 @wp.kernel
@@ -48,14 +62,14 @@ def _add_one(first: int, numbers: wp.array[wp.float32]):
     numbers[first + wp.tid()] += 1.0
 
 
-@pytest.mark.parametrize("module", KERNEL_MODULES, ids=lambda m: m.__name__)
+@pytest.mark.parametrize("module", sorted(KERNELS))
 @pytest.mark.parametrize("arch", [pytest.param(75, marks=pytest.mark.slow), 90])
 def test_kernels_compile_for_cuda(module, arch, tmp_path):
     """Turing and Hopper machine code comes out of every module, and no thread asks for more than it should."""
-    wp.compile_aot_module(module, arch=arch, module_dir=tmp_path, use_ptx=False)
+    wp.compile_aot_module(wp.get_module(module), arch=arch, module_dir=tmp_path, use_ptx=False)
     (cubin,) = tmp_path.glob("*.cubin")
     used = resources(cubin)
-    assert len(used) == sum(name == module.__name__ for m in KERNEL_MODULES for name in compiled_with(m))
+    assert len(used) == KERNELS[module]
     traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
     for name, (registers, local) in used.items():
         if traces_rays and local > _MOST_LOCAL:
@@ -65,15 +79,6 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
         else:
             assert registers <= _MOST_REGISTERS, f"{name}: {registers} registers"
             assert local <= _MOST_LOCAL, f"{name}: {local} bytes of local memory"
-
-
-def compiled_with(module):
-    """For every kernel in a file, the module that it is compiled with: its own, unless the decorator names another."""
-    for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
-        for decorator in getattr(node, "decorator_list", ()):
-            if "wp.kernel" in ast.unparse(decorator):
-                named = {k.arg: k.value for k in getattr(decorator, "keywords", ())}
-                yield named["module"].value if "module" in named else module.__name__
 
 
 def test_resources_are_read(tmp_path):

@@ -225,10 +225,16 @@ def _nearest_present(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max
 @wp.func
 def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest surface along a ray."""
+    return _closest(scene.address, origin, direction, t_max)
+
+
+@wp.func(inline=False)
+def _closest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+    scene = scene_at(address)[0]
     if scene.open_count > 0:
         target = wp.vec4(direction[0], direction[1], direction[2], 0.0)
-        return _nearest_present(scene.address, origin, target, t_max)
-    return _nearest(scene.address, origin, direction, t_max)
+        return _nearest_present(address, origin, target, t_max)
+    return _nearest(address, origin, direction, t_max)
 
 
 @wp.func
