@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -80,6 +80,8 @@ class Launcher:
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self._lock = threading.Lock()
+        self._loader: ThreadPoolExecutor | None = None
+        self._loading: dict[Any, Future[Any]] = {}  # by Warp's module
         self._open: list[_Work] = []  # the latest is the most urgent
         self._helpers = 0  # threads of the pool that look for bands
         self._pace: dict[Any, float] = {}  # seconds per index of a kernel, as last seen
@@ -93,17 +95,41 @@ class Launcher:
     def load(self, modules: Sequence[Any]) -> None:
         """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
 
-        Their order is that in which they are begun: those that take longest should come first.
+        Their order is that in which they are begun: those that take longest should come first. Inside `loading` it
+        returns before they are there, unless the device is a GPU.
         """
-        threads = self.threads if self.device.is_cpu else _usable_cores()
-        with self.profile.phase("compile"), ThreadPoolExecutor(min(threads, len(modules))) as pool:
-            work = [pool.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM) for m in modules]
+        if self._loader is None:
+            with self.loading():
+                self.load(modules)
+            return
+        for m in modules:
+            load = self._loader.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM)
+            self._loading[wp.get_module(m.__name__)] = load
+        if self.device.is_cuda:  # nothing is uploaded meanwhile
+            self._wait_for(*self._loading)
+
+    @contextmanager
+    def loading(self) -> Iterator[None]:
+        """Modules are compiled while the block runs, and are there when it ends; a launch waits for its own."""
+        with ThreadPoolExecutor(self.threads if self.device.is_cpu else _usable_cores()) as self._loader:
             try:
-                for done in work:
-                    done.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+                yield
+                self._wait_for(*self._loading)
+            finally:
+                self._loader.shutdown(cancel_futures=True)
+                self._loader = None
+                self._loading.clear()
+
+    def _wait_for(self, *modules: Any) -> None:
+        """Waits until Warp's modules are there, as far as they are being loaded."""
+        for module in modules:
+            if module in self._loading:
+                start = time.perf_counter()
+                self._loading.pop(module).result()
+                seconds = time.perf_counter() - start
+                self.profile.add("compile", seconds)
+                if self._phase is not None:
+                    self.profile.add(self._phase, -seconds)
 
     def launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
         """Runs ``kernel(first, *inputs)`` for indices 0 to `count` - 1.
@@ -115,6 +141,7 @@ class Launcher:
             raise Cancelled
         if count <= 0:
             return
+        self._wait_for(kernel.module)
         if self.device.is_cuda:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return

@@ -32,7 +32,6 @@ import warp_ir.gbuffer
 import warp_ir.reconstruction.blur
 import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
-import warp_ir.reconstruction.moments
 import warp_ir.reconstruction.observations
 import warp_ir.vpl
 from warp_ir.cost import pixel_bytes
@@ -73,11 +72,14 @@ class Renderer:
             denoise_seconds(1)  # before the work, not after it: it may be missing, and takes its time to start
         self.launcher = Launcher(device, threads)
         self._check_memory(scene)
-        self.launcher.load(_modules(settings.estimator, self.launcher))
         self._told: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._moments: list[_Moment] = []
         self._needs: dict[str, Any] = {}  # of the buffers
-        self._take(scene)
+        large, small = _modules(settings.estimator)
+        with self.launcher.loading():
+            self.launcher.load([*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *large])
+            self._take(scene)
+            self.launcher.load(small)
 
     def update(self, scene: Scene) -> None:
         """Takes another scene in place of its own, and uploads what the two do not share.
@@ -91,7 +93,8 @@ class Renderer:
         self._told = {}, {}
         self.settings = _with_height(self.wanted, scene)
         self._check_memory(scene)
-        self._take(scene)
+        with self.launcher.loading():
+            self._take(scene)
 
     def _take(self, scene: Scene) -> None:
         settings, launcher = self.settings, self.launcher
@@ -106,7 +109,7 @@ class Renderer:
             estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
             self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
         if camera.blurs and settings.filters:
-            launcher.load([warp_ir.reconstruction.blur, warp_ir.reconstruction.moments])
+            launcher.load([warp_ir.reconstruction.blur])
         needs = {
             "columns": camera.columns,
             "rows": camera.rows,
@@ -281,23 +284,19 @@ def trace_vpls(
     return to_host(vpls, uploaded)
 
 
-def _modules(estimator: str, launcher: Launcher) -> list[Any]:
-    """What has kernels that an estimator needs, those that take longest to compile first."""
-    common = [*([warp_ir.bvh.build] if launcher.device.is_cpu else []), warp_ir.film]
+def _modules(estimator: str) -> tuple[list[Any], list[Any]]:
+    """What has kernels that an estimator needs for any scene: what takes long to compile, and the rest."""
     if estimator == "vpl":
-        return [
-            warp_ir.gbuffer,
-            warp_ir.estimators.vpl,
-            warp_ir.vpl,
-            warp_ir.reconstruction.compose,
-            *common,
+        reconstruction = warp_ir.reconstruction.observations, warp_ir.reconstruction.filter
+        return [warp_ir.gbuffer, warp_ir.vpl], [
+            *reconstruction,
             warp_ir.gather,
-            warp_ir.reconstruction.observations,
-            warp_ir.reconstruction.filter,
+            warp_ir.film,
+            warp_ir.reconstruction.compose,
         ]
     if estimator == "keller":
-        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller, *common]
-    return [warp_ir.gbuffer, warp_ir.estimators.path, *common]
+        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film]
+    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film]
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
     return x
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(module="warp_ir.vpl", cuda_max_registers=MOST_REGISTERS)  # so that rays and lights are compiled once
 def _gather_pixels(
     first: int,
     scene: SceneData,
@@ -166,8 +166,9 @@ class VplGatherer:
         self._unguided = unguided(scene, launcher)
         self._guide: Guide | None = self._unguided
         if can_pay(scene):
-            launcher.load([warp_ir.pilot.probes])
             self._guide = None  # to be learned
+            if settings.iteration_limit > _UNGUIDED:
+                launcher.load([warp_ir.pilot.probes])
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""

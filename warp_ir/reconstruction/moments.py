@@ -16,7 +16,7 @@ from warp_ir.gbuffer import Anchor, GBuffer, project
 from warp_ir.launch import Launcher
 from warp_ir.reconstruction.observations import Observations, add_other, add_sample
 from warp_ir.reconstruction.surfaces import MATCH, pixel_around, same_surface
-from warp_ir.surface import Hit, shading_normal
+from warp_ir.surface import Hit, scene_at, shading_normal
 from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -58,9 +58,10 @@ class Point:
     normal: wp.vec3  # without normal maps
 
 
-@wp.func
-def _placed(scene: SceneData, anchor: Anchor, triangle: int, facing: wp.vec3) -> Point:
+@wp.func(inline=False)
+def _placed(address: wp.uint64, anchor: Anchor, triangle: int, facing: wp.vec3) -> Point:
     """Where a point of a triangle is; its normal is on the side of `facing`."""
+    scene = scene_at(address)[0]
     hit = Hit()
     hit.triangle = triangle
     hit.instance = anchor.instance
@@ -91,15 +92,15 @@ def at_middle(blur: Blur, moment: int, anchor: Anchor, position: wp.vec3, normal
         row = anchor.triangle
         if moving:
             row -= blur.shifts[moment]
-        there = _placed(blur.scenes[moment], anchor, anchor.triangle, normal)
-        here = _placed(blur.scenes[blur.middle], anchor, row, normal)
+        there = _placed(blur.scenes[moment].address, anchor, anchor.triangle, normal)
+        here = _placed(blur.scenes[blur.middle].address, anchor, row, normal)
         # What the point is off its triangle, as on smooth surfaces, it stays.
         out.position += here.position - there.position
         out.normal += here.normal - there.normal
     return out
 
 
-@wp.kernel
+@wp.kernel(module="warp_ir.reconstruction.blur")  # so that what they share is compiled once
 def _aim(
     first: int,
     blur: Blur,
@@ -138,7 +139,7 @@ def _aim(
             add_other(seen, p, direct[p], indirect[p])
 
 
-@wp.kernel
+@wp.kernel(module="warp_ir.reconstruction.blur")
 def _take(
     first: int,
     samples: int,
@@ -155,7 +156,7 @@ def _take(
         k += 1
 
 
-@wp.kernel
+@wp.kernel(module="warp_ir.reconstruction.blur")
 def _guess_noise(first: int, seen: Observations) -> None:
     """Of pixels without samples: the noise of their neighbours' on the same surface."""
     p = first + wp.tid()
