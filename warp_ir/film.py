@@ -26,6 +26,7 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 """What `Film.aov` can give beside the radiance."""
 Image = npt.NDArray[Any]
 _RADIANCE = ("emission", "direct", "indirect")
+_TRUST = wp.constant(0.25)  # of a mean that is as large as its standard error, over that of its neighbours
 _CLEAN_ITERATIONS = 8
 """From here on albedo and normals are smoother than what a denoiser would make of them."""
 _SEEN = "seen_"
@@ -131,29 +132,89 @@ def _off_neighbors(film: FilmData, tiles: Tiles, tile: int, k: int) -> wp.vec3:
     return sum / wp.max(count, 1.0)
 
 
+@wp.func
+def _mean(film: FilmData, i: int) -> wp.vec3:
+    return emission_of(film, i) + film.direct[i] + film.indirect[i]
+
+
+@wp.func
+def _median(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    return wp.max(wp.min(a, b), wp.min(wp.max(a, b), c))
+
+
+@wp.func
+def _median_of_row(film: FilmData, columns: int, x: int, y: int) -> wp.vec3:
+    row = y * columns
+    left = _mean(film, row + wp.max(x - 1, 0))
+    return _median(left, _mean(film, row + x), _mean(film, row + wp.min(x + 1, columns - 1)))
+
+
+@wp.func
+def _around(film: FilmData, tiles: Tiles, i: int) -> wp.vec3:
+    """What a pixel and its eight neighbours have for the most part, but no more than itself: the median of medians."""
+    x = i % tiles.columns
+    y = i // tiles.columns
+    above = _median_of_row(film, tiles.columns, x, wp.max(y - 1, 0))
+    below = _median_of_row(film, tiles.columns, x, wp.min(y + 1, tiles.rows - 1))
+    return wp.min(_mean(film, i), _median(above, _median_of_row(film, tiles.columns, x, y), below))
+
+
+@wp.func
+def _likely(mean: wp.float64, variance: wp.float64, around: wp.float64) -> wp.float64:
+    """Radiance to which the error of a mean is relative: the less certain that is, the more that of its neighbours.
+
+    A mean that is too large by chance has a large error, and would hide it: a pixel that meets one lamp in a hundred
+    samples is off by the lamp's light, not by 100 %.
+    """
+    if variance <= wp.float64(0.0):
+        return mean
+    ratio = mean * mean / variance
+    return mean + (around - mean) / (wp.float64(1.0) + wp.float64(_TRUST) * ratio * ratio)
+
+
 @wp.kernel
-def _measure(first: int, film: FilmData, tiles: Tiles, floor: wp.float64, out: wp.array[wp.vec2d]) -> None:
-    """Sums over a tile: of the radiance L, and of its se² / (L² + floor)."""
+def _measure(
+    first: int,
+    film: FilmData,
+    tiles: Tiles,
+    floor: wp.float64,
+    apart: wp.array[wp.vec3],
+    out: wp.array[wp.vec4d],
+) -> None:
+    """Sums over a tile: of the radiance L, and, if there is a floor, of its se² / (L² + floor).
+
+    The latter once more where the filter has changed the mean, and the same of the square of that change.
+    """
     tile = first + wp.tid()
-    radiance = wp.float64(0.0)
-    error = wp.float64(0.0)
+    sums = wp.vec4d()
     for k in range(64):
         i = pixel_of_tile(tiles, tile, k)
         if i >= 0:
-            mean = emission_of(film, i) + film.direct[i] + film.indirect[i]
+            mean = _mean(film, i)
+            around = wp.vec3(0.0)
+            if floor > wp.float64(0.0):
+                around = _around(film, tiles, i)
             off = film.deviation[i]
             free = float(film.count[i] - 1)
             if film.count[i] == 1:  # its neighbours may say something
                 off = _off_neighbors(film, tiles, tile, k)
                 free = 1.5
+            change = wp.vec3(0.0)
+            if apart.shape[0] > 0:
+                change = apart[i]
             for c in range(3):
-                x = wp.float64(mean[c])
                 s = wp.float64(off[c])
+                variance = s * s / wp.float64(free)
+                x = _likely(wp.float64(mean[c]), variance, wp.float64(around[c]))
                 scale = x * x + floor
-                radiance += x
-                if scale > wp.float64(0.0):
-                    error += s * s / (scale * wp.float64(free))
-    out[tile] = wp.vec2d(radiance, error)
+                sums[0] += wp.float64(mean[c])
+                if floor > wp.float64(0.0):
+                    sums[1] += variance / scale
+                    d = wp.float64(change[c])
+                    if d != wp.float64(0.0):
+                        sums[2] += variance / scale
+                        sums[3] += d * d / scale
+    out[tile] = sums
 
 
 class Film:
@@ -291,34 +352,73 @@ class Film:
         return np.asarray(self._resolved[1])
 
     def standard_error(self) -> npt.NDArray[np.float32]:
-        """Standard error of the mean, float32 [height, width, 3], from the spread of the iterations.
+        """Standard error of `radiance` per pixel, float32 [height, width, 3]: √(se² + b²).
 
-        Iterations are independent but for the stratified pixel jitter: on edges the true error is smaller.
-        Infinite with fewer than two iterations.
+        se is that of the plain mean, by the spread of its iterations. Those are independent but for the pixel's
+        stratified jitter: on edges the true error is smaller. What no iteration has met it cannot know: on the very
+        edge of a lamp, before the first sample that hits it, it is too small.
+
+        b is the filter's bias, 0 without a filter: of the squared difference between its picture and the plain mean,
+        the share that is more than se² explains, over a tile of 8 x 8 pixels. The noise that the filter takes away is
+        not subtracted, since neighbours share what it leaves: where it works well, the error is about half of this.
+        What a denoiser does is not in it.
+
+        Infinite where there are fewer than two iterations.
         """
         n = self._data.count.numpy().reshape(self.height, self.width, 1)
         error = self._sum("deviation") / np.sqrt(np.maximum(n - 1, 1), dtype=np.float32)
+        if self.reconstruction is not None and self.iterations > 1:
+            apart = self._apart()
+            noise, change = self._measure(self._floor(), apart)[:, 2:].T
+            share = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
+            tiles = share.astype(np.float32).reshape(-(-self.height // TILE), -1)
+            pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: self.height, : self.width, None]
+            error = np.hypot(error, apart * pixels)
         return np.where(n > 1, error, np.float32(np.inf))
 
     def error(self) -> float:
-        """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²), m the mean of L.
+        """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²).
+
+        se is `standard_error`: if there is a filter, the picture has to be made for it, unless it has been. m is the
+        mean of the radiance L. Where L is uncertain, its neighbours' stands for it in part, if that is less: what is
+        bright by chance is off by more than its own brightness tells.
 
         NaN with fewer than two iterations.
         """
         if self.iterations < 2:
             return math.nan
-        return math.sqrt(self.squared_errors().sum())
+        return math.sqrt(self.squared_errors(filtered=True).sum())
 
-    def squared_errors(self) -> npt.NDArray[np.float64]:
-        """What every tile of 8 x 8 pixels has in the square of `error`, [tiles], row by row."""
-        values = 3 * self.width * self.height
-        mean = self._measure(0.0)[:, 0].sum() / values
-        return np.asarray(self._measure(0.01 * mean**2)[:, 1] / values)
+    def squared_errors(self, *, filtered: bool = False) -> npt.NDArray[np.float64]:
+        """What every tile of 8 x 8 pixels has in the square of `error`, [tiles], row by row.
 
-    def _measure(self, floor: float) -> Any:
-        """Sums over each tile: of the radiance L, and of its se² / (L² + floor)."""
-        tiles = self._launcher.empty(tile_count(self.width, self.height), wp.vec2d)
-        self._launcher.launch(_measure, tiles.shape[0], [self._data, self.tiles, floor, tiles])
+        `filtered` says whether to make the picture and to add the filter's part.
+        """
+        wanted = filtered and self.reconstruction is not None and self.iterations > 1
+        _, error, noise, change = self._measure(self._floor(), self._apart() if wanted else None).T
+        return np.asarray((error + np.maximum(change - noise, 0.0)) / (3 * self.width * self.height))
+
+    def _apart(self) -> npt.NDArray[np.float32]:
+        """How far the filtered picture is off the plain mean, [height, width, 3]; 0 beside what emits.
+
+        There the filter has seen more of the pixel than the mean, by more camera rays.
+        """
+        apart = np.asarray(self._reconstruct()[:2].sum(axis=0) - self._sum(*_RADIANCE))
+        glows = np.pad(self._sum("emission").max(axis=-1) > 0.0, 1)
+        for axis in (0, 1):
+            glows = glows | np.roll(glows, 1, axis) | np.roll(glows, -1, axis)
+        return np.where(glows[1:-1, 1:-1, None], np.float32(0.0), apart)
+
+    def _floor(self) -> float:
+        """0.01 m² of `error`."""
+        mean = self._measure(0.0)[:, 0].sum() / (3 * self.width * self.height)
+        return float(0.01 * mean**2)
+
+    def _measure(self, floor: float, apart: Image | None = None) -> Any:
+        """The sums of the kernel of that name, [tiles, 4]; `apart` is what the filter changes."""
+        tiles = self._launcher.empty(tile_count(self.width, self.height), wp.vec4d)
+        change = self._launcher.array(np.zeros((0, 3)) if apart is None else apart.reshape(-1, 3), wp.vec3)
+        self._launcher.launch(_measure, tiles.shape[0], [self._data, self.tiles, floor, change, tiles])
         return tiles.numpy()
 
     def aov(self, name: str) -> Image:

@@ -41,7 +41,9 @@ class RenderSettings:
     iterations: int | None = _setting(None, "stop after this many iterations (64 if no other limit is given)")
     time_limit: float | None = _setting(None, "stop after this many seconds of rendering")
     target_error: float | None = _setting(
-        None, "stop when the estimated relative RMS error of the picture is below this"
+        None,
+        "stop when the estimated relative RMS error of the picture, noise and the filter's bias, is below this; the"
+        " true error is about that or smaller",
     )
     light_paths: int | None = _setting(
         None,

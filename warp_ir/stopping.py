@@ -36,7 +36,7 @@ class Progress:
     seconds: float
     """Seconds of rendering so far."""
     error: float
-    """`Film.error` as last measured; NaN before two iterations."""
+    """As `Film.error`, last measured; without the filter's part while the target is far. NaN before two iterations."""
     fraction: float
     """Share of the nearest limit that is used up, 0 to 1."""
     seconds_left: float
@@ -67,9 +67,13 @@ class Stopping:
         left = math.inf if limit is None else limit - reserve - film.seconds
         most = (_HASTE * left - per_iteration) / per_tile
         short = self._chooses and per_iteration + per_tile * film.chosen.sum() > left
-        if short or _is_due(film.iterations):
+        due = _is_due(film.iterations)
+        if short or due:
             squares = film.squared_errors()
-            self._error = math.sqrt(squares.sum()) if film.iterations > 1 else math.nan
+            if due and math.sqrt(squares.sum()) <= (self._settings.target_error or 0.0):
+                squares = film.squared_errors(filtered=True)  # dear: the picture has to be made
+            if due:
+                self._error = math.sqrt(squares.sum())
             if self._chooses:
                 film.choose(worthwhile(squares, film.tile_iterations, most))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())
