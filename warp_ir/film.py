@@ -27,6 +27,7 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 Image = npt.NDArray[Any]
 _RADIANCE = ("emission", "direct", "indirect")
 _TRUST = wp.constant(0.25)  # of a mean that is as large as its standard error, over that of its neighbours
+_DOUBT = wp.constant(5.0)  # times the standard error, below which a mean is compared with those of its neighbours
 _CLEAN_ITERATIONS = 8
 """From here on albedo and normals are smoother than what a denoiser would make of them."""
 _SEEN = "seen_"
@@ -191,14 +192,14 @@ def _measure(
         i = pixel_of_tile(tiles, tile, k)
         if i >= 0:
             mean = _mean(film, i)
-            around = wp.vec3(0.0)
-            if floor > wp.float64(0.0):
-                around = _around(film, tiles, i)
             off = film.deviation[i]
             free = float(film.count[i] - 1)
             if film.count[i] == 1:  # its neighbours may say something
                 off = _off_neighbors(film, tiles, tile, k)
                 free = 1.5
+            around = mean
+            if floor > wp.float64(0.0) and wp.max(wp.abs(off) * _DOUBT - mean * wp.sqrt(free)) > 0.0:
+                around = _around(film, tiles, i)
             change = wp.vec3(0.0)
             if apart.shape[0] > 0:
                 change = apart[i]
