@@ -21,8 +21,8 @@ _FIXED = 0.2
 """Time of an iteration without tiles to that of one with all of them, about: choices must not hang on clocks."""
 _LEAST = 1 / 8
 """Share of the tiles that an iteration is for at least: else it is no work for many cores."""
-_HASTE = 0.95
-"""Share of the time left that the last iteration is planned to take."""
+_HASTE = 0.8
+"""Share of the time left that the last iteration is planned to take: the worst tiles take longer than others."""
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
