@@ -60,8 +60,8 @@ class Stopping:
             fixed: Share of the time since the beginning that would have passed without any tiles.
         """
         film, limit = self._film, self._settings.time_limit
-        seconds, iterations, tiles = self._before
-        seconds = film.seconds - seconds
+        begin, iterations, tiles = self._before
+        seconds = film.seconds - begin
         per_iteration = fixed * seconds / (film.iterations - iterations)
         per_tile = (1.0 - fixed) * seconds / (int(film.tile_iterations.sum()) - tiles)
         left = math.inf if limit is None else limit - reserve - film.seconds
