@@ -217,9 +217,9 @@ def _shadowed(
     return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
 
 
-@wp.func
+@wp.func(inline=False)
 def gather(
-    scene: SceneData,
+    address: wp.uint64,
     parts: wp.array[VplSets],
     part: int,
     which: float,
@@ -230,23 +230,10 @@ def gather(
 ) -> wp.vec3:
     """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
 
-    `part` is `ON_LIGHTS` or `ON_SURFACES`. `which` in [0, 1) chooses the set, `u` in [0, 1) is the offset of the
-    systematic choice of VPLs. Those of more than `max_bounce` reflections are dark. `rays` is 8 at most.
+    `address` is that of the scene, `part` is `ON_LIGHTS` or `ON_SURFACES`. `which` in [0, 1) chooses the set, `u` in
+    [0, 1) is the offset of the systematic choice of VPLs. Those of more than `max_bounce` reflections are dark. `rays`
+    is 8 at most.
     """
-    return _gather(scene.address, parts, part, which, x, u, rays, max_bounce)
-
-
-@wp.func(inline=False)
-def _gather(
-    address: wp.uint64,
-    parts: wp.array[VplSets],
-    part: int,
-    which: float,
-    x: Receiver,
-    u: float,
-    rays: int,
-    max_bounce: int,
-) -> wp.vec3:
     scene = scene_at(address)[0]
     lit = parts[part]
     chosen = int(which * float(lit.sets))

@@ -111,8 +111,8 @@ def _gather_pixels(
         while depth <= settings.max_bounces:
             u = sampling.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
             bounces = settings.max_bounces - depth
-            by_lights = gather(scene, parts, ON_LIGHTS, which, x, u[0], rays[0], bounces)
-            by_surfaces = gather(scene, parts, ON_SURFACES, which, x, u[1], rays[1], bounces)
+            by_lights = gather(scene.address, parts, ON_LIGHTS, which, x, u[0], rays[0], bounces)
+            by_surfaces = gather(scene.address, parts, ON_SURFACES, which, x, u[1], rays[1], bounces)
             if depth == 0:
                 once = by_lights
                 more = by_surfaces
