@@ -64,8 +64,8 @@ def some_tiles(
     tiles = Tiles()
     tiles.columns, tiles.rows = columns, rows
     tiles.numbers, tiles.missed = launcher.array(np.flatnonzero(which), wp.int32), launcher.array(missed, wp.int32)
-    covered = np.repeat(np.repeat(which.reshape(-(-rows // TILE), -1), TILE, axis=0), TILE, axis=1)
-    tiles.pixels = int(covered[:rows, :columns].sum())
+    heights, widths = (np.minimum(TILE, size - np.arange(0, size, TILE)) for size in (rows, columns))
+    tiles.pixels = int(heights @ which.reshape(len(heights), -1) @ widths)
     return tiles
 
 
