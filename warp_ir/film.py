@@ -1,8 +1,4 @@
-"""The film: a mean, a standard deviation and a count. Iterations add, films merge, the picture is the mean.
-
-Both are brought up to date by how far each iteration is off the mean (Welford 1962): what is lost to rounding is
-forgotten as the samples are that it came with, and float32 does not drift over a hundred thousand iterations.
-"""
+"""The film: a mean, a standard deviation and a count. Iterations add, films merge, the picture is the mean."""
 
 import math
 import os
@@ -15,207 +11,20 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.denoise import denoise
-from warp_ir.gbuffer import GBuffer
+from warp_ir.film_data import FilmData, add_samples
+from warp_ir.film_error import measure
 from warp_ir.launch import Launcher
 from warp_ir.scene import InputError
-from warp_ir.tiles import TILE, Tiles, all_tiles, indices, pixel_at, pixel_of_tile, some_tiles, tile_count
-
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+from warp_ir.tiles import TILE, all_tiles, some_tiles, tile_count
 
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 """What `Film.aov` can give beside the radiance."""
 Image = npt.NDArray[Any]
 _RADIANCE = ("emission", "direct", "indirect")
-_TRUST = wp.constant(0.25)  # of a mean that is as large as its standard error, over that of its neighbours
-_DOUBT = wp.constant(5.0)  # times the standard error, below which a mean is compared with those of its neighbours
 _CLEAN_ITERATIONS = 8
 """From here on albedo and normals are smoother than what a denoiser would make of them."""
 _SEEN = "seen_"
 """What the names of the filter's arrays begin with in a file."""
-
-
-@wp.struct
-class FilmData:
-    """Radiance, a mean over iterations, and what else there is, sums; one row per pixel."""
-
-    count: wp.array[wp.int32]  # iterations
-    emission: wp.array[wp.vec3]  # empty if there can be none
-    direct: wp.array[wp.vec3]  # light reflected once
-    indirect: wp.array[wp.vec3]
-    deviation: wp.array[wp.vec3]  # standard deviation of the sum of the three
-    albedo: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]
-    position: wp.array[wp.vec3]
-    depth: wp.array[wp.float32]
-    hits: wp.array[wp.int32]  # iterations in which the pixel's ray met a surface
-    rejected: wp.array[wp.int32]  # iterations whose value was not finite
-    mesh: wp.array[wp.int32]  # what the first iteration saw
-
-
-@wp.func
-def _finite(v: wp.vec3) -> bool:
-    return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
-
-
-@wp.func
-def _deviation(old: wp.vec3, off: wp.vec3, share: float) -> wp.vec3:
-    """The standard deviations when a sample is added which is so much of them all, and so far off their mean."""
-    # Squares are taken in a scale in which they neither overflow nor vanish.
-    scale = wp.max(wp.max(wp.max(old), wp.max(wp.abs(off))), 1.0e-37)
-    a = old * (1.0 / scale)
-    b = off * (1.0 / scale)
-    variance = (wp.cw_mul(a, a) + wp.cw_mul(b, b) * share) * (1.0 - share)
-    return wp.vec3(wp.sqrt(variance[0]), wp.sqrt(variance[1]), wp.sqrt(variance[2])) * scale
-
-
-@wp.func
-def emission_of(film: FilmData, i: int) -> wp.vec3:
-    """Radiance that reaches the camera without reflection."""
-    if film.emission.shape[0] > 0:
-        return film.emission[i]
-    return wp.vec3(0.0)
-
-
-@wp.kernel
-def _add(
-    first: int,
-    gbuffer: GBuffer,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
-    exposure: float,
-    film: FilmData,
-) -> None:
-    """Adds one iteration's estimates."""
-    i = pixel_at(gbuffer.tiles, first + wp.tid())
-    if i < 0:
-        return
-    before = film.count[i]
-    le = wp.vec3(0.0)
-    if film.emission.shape[0] > 0:
-        le = gbuffer.emission[i] * exposure
-    once = wp.cw_mul(gbuffer.albedo[i], direct[i]) * exposure
-    more = wp.cw_mul(gbuffer.albedo[i], indirect[i]) * exposure
-    if not _finite(le + once + more):
-        film.rejected[i] += 1
-        le = wp.vec3(0.0)
-        once = wp.vec3(0.0)
-        more = wp.vec3(0.0)
-    share = 1.0 / float(before + 1)
-    off = le + once + more - (emission_of(film, i) + film.direct[i] + film.indirect[i])
-    film.deviation[i] = _deviation(film.deviation[i], off, share)
-    if film.emission.shape[0] > 0:
-        film.emission[i] += (le - film.emission[i]) * share
-    film.direct[i] += (once - film.direct[i]) * share
-    film.indirect[i] += (more - film.indirect[i]) * share
-    film.count[i] = before + 1
-    if before == 0:
-        film.mesh[i] = gbuffer.mesh[i]
-    if gbuffer.mesh[i] >= 0:
-        film.hits[i] += 1
-        film.albedo[i] += gbuffer.albedo[i]
-        film.normal[i] += gbuffer.shading_normal[i]
-        film.position[i] += gbuffer.position[i]
-        film.depth[i] += gbuffer.depth[i]
-
-
-@wp.func
-def _off_neighbors(film: FilmData, tiles: Tiles, tile: int, k: int) -> wp.vec3:
-    """How far a pixel of one sample is off the two beside it on its mesh, were they of its colour."""
-    i = pixel_of_tile(tiles, tile, k)
-    sum = wp.vec3(0.0)
-    count = float(0.0)
-    for direction in range(2):
-        j = pixel_of_tile(tiles, tile, k ^ (1 + 7 * direction))
-        if j >= 0 and film.mesh[j] == film.mesh[i] and wp.min(film.albedo[j]) > 0.0:
-            there = wp.cw_mul(wp.cw_div(film.direct[j] + film.indirect[j], film.albedo[j]), film.albedo[i])
-            sum += there - film.direct[i] - film.indirect[i]
-            count += 1.0
-    return sum / wp.max(count, 1.0)
-
-
-@wp.func
-def _mean(film: FilmData, i: int) -> wp.vec3:
-    return emission_of(film, i) + film.direct[i] + film.indirect[i]
-
-
-@wp.func
-def _median(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    return wp.max(wp.min(a, b), wp.min(wp.max(a, b), c))
-
-
-@wp.func
-def _median_of_row(film: FilmData, columns: int, x: int, y: int) -> wp.vec3:
-    row = y * columns
-    left = _mean(film, row + wp.max(x - 1, 0))
-    return _median(left, _mean(film, row + x), _mean(film, row + wp.min(x + 1, columns - 1)))
-
-
-@wp.func
-def _around(film: FilmData, tiles: Tiles, i: int) -> wp.vec3:
-    """What a pixel and its eight neighbours have for the most part, but no more than itself: the median of medians."""
-    x = i % tiles.columns
-    y = i // tiles.columns
-    above = _median_of_row(film, tiles.columns, x, wp.max(y - 1, 0))
-    below = _median_of_row(film, tiles.columns, x, wp.min(y + 1, tiles.rows - 1))
-    return wp.min(_mean(film, i), _median(above, _median_of_row(film, tiles.columns, x, y), below))
-
-
-@wp.func
-def _likely(mean: wp.float64, variance: wp.float64, around: wp.float64) -> wp.float64:
-    """Radiance to which the error of a mean is relative: the less certain that is, the more that of its neighbours.
-
-    A mean that is too large by chance has a large error, and would hide it: a pixel that meets one lamp in a hundred
-    samples is off by the lamp's light, not by 100 %.
-    """
-    if variance <= wp.float64(0.0):
-        return mean
-    ratio = mean * mean / variance
-    return mean + (around - mean) / (wp.float64(1.0) + wp.float64(_TRUST) * ratio * ratio)
-
-
-@wp.kernel
-def _measure(
-    first: int,
-    film: FilmData,
-    tiles: Tiles,
-    floor: wp.float64,
-    apart: wp.array[wp.vec3],
-    out: wp.array[wp.vec4d],
-) -> None:
-    """Sums over a tile: of the radiance L, and, if there is a floor, of its se² / (L² + floor).
-
-    The latter once more where the filter has changed the mean, and the same of the square of that change.
-    """
-    tile = first + wp.tid()
-    sums = wp.vec4d()
-    for k in range(64):
-        i = pixel_of_tile(tiles, tile, k)
-        if i >= 0:
-            mean = _mean(film, i)
-            off = film.deviation[i]
-            free = float(film.count[i] - 1)
-            if film.count[i] == 1:  # its neighbours may say something
-                off = _off_neighbors(film, tiles, tile, k)
-                free = 1.5
-            around = mean
-            if floor > wp.float64(0.0) and wp.max(wp.abs(off) * _DOUBT - mean * wp.sqrt(free)) > 0.0:
-                around = _around(film, tiles, i)
-            change = wp.vec3(0.0)
-            if apart.shape[0] > 0:
-                change = apart[i]
-            for c in range(3):
-                s = wp.float64(off[c])
-                variance = s * s / wp.float64(free)
-                x = _likely(wp.float64(mean[c]), variance, wp.float64(around[c]))
-                scale = x * x + floor
-                sums[0] += wp.float64(mean[c])
-                if floor > wp.float64(0.0):
-                    sums[1] += variance / scale
-                    d = wp.float64(change[c])
-                    if d != wp.float64(0.0):
-                        sums[2] += variance / scale
-                        sums[3] += d * d / scale
-    out[tile] = sums
 
 
 class Film:
@@ -230,7 +39,7 @@ class Film:
         """
         self.width, self.height = width, height
         self.iterations = 0
-        """Iterations added; tiles that were done before have fewer (`Film.done`)."""
+        """Iterations added; some may not have been for all tiles (`tile_iterations`)."""
         self.seconds = 0.0
         """Wall time of rendering them [s], without loading and compiling."""
         self.interrupted = 0
@@ -273,13 +82,13 @@ class Film:
 
     def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0, moment: int = 0) -> None:
         """Adds one iteration: what the camera saw at some moment, and the irradiance over π estimated for it."""
-        self._launcher.launch(_add, indices(gbuffer.tiles), [gbuffer, direct, indirect, exposure, self._data])
+        add_samples(gbuffer, direct, indirect, exposure, self._data, self._launcher)
         if self.reconstruction is not None:
             self.reconstruction.observe(gbuffer, direct, indirect, moment)
         self.iterations += 1
         if not self.chosen.all():
             self._missed += ~self.chosen
-            self.choose(self.chosen)
+            self.tiles.missed = self._launcher.array(self._missed, wp.int32)
 
     def merge(self, other: "Film") -> None:
         """Adds another film of the same picture; that it used other iterations or another seed is up to you.
@@ -370,7 +179,7 @@ class Film:
         error = self._sum("deviation") / np.sqrt(np.maximum(n - 1, 1), dtype=np.float32)
         if self.reconstruction is not None and self.iterations > 1:
             apart = self._apart()
-            noise, change = self._measure(self._floor(), apart)[:, 2:].T
+            noise, change = measure(self._data, self.tiles, self._floor(), self._launcher, apart)[:, 2:].T
             share = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
             tiles = share.astype(np.float32).reshape(-(-self.height // TILE), -1)
             pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: self.height, : self.width, None]
@@ -396,7 +205,8 @@ class Film:
         `filtered` says whether to make the picture and to add the filter's part.
         """
         wanted = filtered and self.reconstruction is not None and self.iterations > 1
-        _, error, noise, change = self._measure(self._floor(), self._apart() if wanted else None).T
+        apart = self._apart() if wanted else None
+        _, error, noise, change = measure(self._data, self.tiles, self._floor(), self._launcher, apart).T
         return np.asarray((error + np.maximum(change - noise, 0.0)) / (3 * self.width * self.height))
 
     def _apart(self) -> npt.NDArray[np.float32]:
@@ -412,15 +222,8 @@ class Film:
 
     def _floor(self) -> float:
         """0.01 m² of `error`."""
-        mean = self._measure(0.0)[:, 0].sum() / (3 * self.width * self.height)
+        mean = measure(self._data, self.tiles, 0.0, self._launcher)[:, 0].sum() / (3 * self.width * self.height)
         return float(0.01 * mean**2)
-
-    def _measure(self, floor: float, apart: Image | None = None) -> Any:
-        """The sums of the kernel of that name, [tiles, 4]; `apart` is what the filter changes."""
-        tiles = self._launcher.empty(tile_count(self.width, self.height), wp.vec4d)
-        change = self._launcher.array(np.zeros((0, 3)) if apart is None else apart.reshape(-1, 3), wp.vec3)
-        self._launcher.launch(_measure, tiles.shape[0], [self._data, self.tiles, floor, change, tiles])
-        return tiles.numpy()
 
     def aov(self, name: str) -> Image:
         """One of `AOV_NAMES`.

@@ -26,7 +26,7 @@ import warp_ir.bvh.build
 import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
-import warp_ir.film
+import warp_ir.film_data
 import warp_ir.gather
 import warp_ir.gbuffer
 import warp_ir.reconstruction.blur
@@ -291,12 +291,12 @@ def _modules(estimator: str) -> tuple[list[Any], list[Any]]:
         return [warp_ir.gbuffer, warp_ir.vpl], [
             *reconstruction,
             warp_ir.gather,
-            warp_ir.film,
+            warp_ir.film_data,
             warp_ir.reconstruction.compose,
         ]
     if estimator == "keller":
-        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film]
-    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film]
+        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film_data]
+    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film_data]
 
 
 @contextmanager

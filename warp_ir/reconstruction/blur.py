@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.film import FilmData
+from warp_ir.film_data import FilmData
 from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, project, see
 from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
