@@ -1,0 +1,120 @@
+"""Prints a hash of the pixels of some twenty small renders: over all estimators, filters and kinds of scene.
+
+A change that is not meant to change pictures leaves every hash as it was. Hashes are only comparable on one machine and
+one device: compilers for other processors round differently.
+
+python scripts/hash_pictures.py --write before.json     # before the change
+python scripts/hash_pictures.py --compare before.json   # after it; exit code 1 if a picture has changed
+"""
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import warp_ir as ir
+
+SCENES = Path(__file__).parent.parent / "scenes_usd"
+AOVS = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
+
+Render = Callable[[str], list[np.ndarray]]
+"""From a device's name to all arrays of a picture."""
+
+
+def film_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
+    """Renders a scene and returns its radiance, standard error and AOVs."""
+
+    def render(device: str) -> list[np.ndarray]:
+        film = ir.render(scene(), ir.RenderSettings(**settings), device=device)
+        return [film.radiance(), film.standard_error(), *(film.aov(name) for name in AOVS)]
+
+    return render
+
+
+def vpls_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
+    """Traces the VPLs of a scene."""
+
+    def trace(device: str) -> list[np.ndarray]:
+        vpls = ir.trace_vpls(scene(), ir.RenderSettings(**settings), device=device)
+        return [vpls.positions, vpls.normals, vpls.intensity, vpls.bounce]
+
+    return trace
+
+
+def stage(name: str, **camera: object) -> Callable[[], ir.Scene]:
+    """Reads a test scene; `camera` replaces fields of its camera."""
+
+    def load() -> ir.Scene:
+        scene = ir.load_usd(SCENES / f"{name}.usda")
+        return replace(scene, camera=replace(scene.camera, **camera)) if camera else scene
+
+    return load
+
+
+def blurred() -> ir.Scene:
+    """The turntable with an open shutter."""
+    reader = ir.StageReader(SCENES / "turntable.usda")
+    return reader.read(4.0)
+
+
+def renders() -> Iterator[tuple[str, Render]]:
+    """The name of each picture, and how it is made."""
+    small = {"width": 64, "iterations": 6}
+    yield "cornell_box vpl", film_of(stage("cornell_box"), **small)
+    yield "cornell_box vpl plain", film_of(stage("cornell_box"), filter=False, **small)
+    yield "cornell_box vpl lights", film_of(stage("cornell_box"), visible_lights=True, **small)
+    yield "cornell_box vpl denoise", film_of(stage("cornell_box"), denoise=True, **small)
+    yield "cornell_box vpl lens", film_of(stage("cornell_box", lens_radius=0.1, focus_distance=3.0), **small)
+    yield "cornell_box vpl error", film_of(stage("cornell_box"), width=64, target_error=0.05)
+    yield "cornell_box vpl fractional", film_of(stage("cornell_box"), absorption="fractional", max_bounces=3, **small)
+    yield "cornell_box keller", film_of(stage("cornell_box"), estimator="keller", width=32, iterations=2)
+    yield (
+        "cornell_box keller bounded",
+        film_of(
+            stage("cornell_box"), estimator="keller", absorption="roulette", bound_radius=0.1, width=32, iterations=2
+        ),
+    )
+    yield "cornell_box path", film_of(stage("cornell_box"), estimator="path", **small)
+    for name in ("corridor", "crowded_room", "two_rooms", "light_types", "thousand_lights", "thin_walls"):
+        yield f"{name} vpl", film_of(stage(name), visible_lights=True, **small)
+        yield f"{name} path", film_of(stage(name), estimator="path", visible_lights=True, width=48, iterations=2)
+    for name in ("furnace_sphere", "furnace_cube"):
+        yield f"{name} vpl", film_of(stage(name), width=32, iterations=4)
+    yield "turntable blurred vpl", film_of(blurred, **small)
+    yield "turntable blurred path", film_of(blurred, estimator="path", width=48, iterations=2)
+    for name in ("cornell_box", "light_types", "two_rooms"):
+        yield f"{name} vpls", vpls_of(stage(name))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Hash the pixels of some small renders.")
+    parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write the hashes as JSON")
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="hashes to compare with")
+    parser.add_argument("-k", dest="name", default="", metavar="TEXT", help="only pictures with this in their name")
+    args = parser.parse_args()
+
+    before = json.loads(args.compare.read_text()) if args.compare else {}
+    hashes, changed = {}, []
+    for name, render in renders():
+        if args.name not in name:
+            continue
+        hashes[name] = hashlib.sha256(
+            b"".join(np.ascontiguousarray(a).tobytes() for a in render(args.device))
+        ).hexdigest()[:16]
+        differs = before.get(name, hashes[name]) != hashes[name]
+        changed += [name] * differs
+        print(f"{hashes[name]}  {name}{'  CHANGED' if differs else ''}", flush=True)
+    if args.write:
+        args.write.write_text(json.dumps(hashes, indent=1) + "\n")
+    if changed:
+        sys.exit(f"{len(changed)} of {len(hashes)} pictures have changed")
+
+
+if __name__ == "__main__":
+    main()
