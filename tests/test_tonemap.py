@@ -5,7 +5,7 @@ import pytest
 
 from warp_ir import InputError
 from warp_ir.tonemap import filmic, srgb_from_linear, suggest_exposure, tone_map
-from warp_ir.usd.color import srgb_to_linear
+from warp_ir.usd.values.source_color_space import srgb_to_linear
 
 
 def test_srgb_matches_the_standard():

@@ -9,7 +9,7 @@ from tests.test_usd_look import RGBA, ST, mesh
 from tests.test_usd_material import load, material_text, only_material, warned
 from tests.test_usd_texture import write
 from warp_ir.scene import Wrap
-from warp_ir.usd.texture import srgb_to_linear
+from warp_ir.usd.images.asset import srgb_to_linear
 
 DIFFUSE = "color3f inputs:diffuseColor ="
 MEAN = RGBA[..., :3].mean(axis=-1)

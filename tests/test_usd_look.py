@@ -12,7 +12,7 @@ import warp_ir as ir
 from tests.test_usd_material import QUADS, load, material_text, only_material, warned
 from tests.test_usd_texture import write
 from warp_ir.scene import Wrap
-from warp_ir.usd.texture import srgb_to_linear
+from warp_ir.usd.images.asset import srgb_to_linear
 
 ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
 ST = "texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0), (2, 1)] (interpolation = 'vertex')"
@@ -371,7 +371,7 @@ def test_images_are_read_once_and_only_where_used(tmp_path, image):
 
 def test_more_pixels_than_the_budget(tmp_path, image, monkeypatch):
     """Images are averaged down, said once, and keep their mean."""
-    monkeypatch.setattr("warp_ir.usd.images.MAX_TEXTURE_PIXELS", 8)
+    monkeypatch.setattr("warp_ir.usd.images.cache.MAX_TEXTURE_PIXELS", 8)
     scene = load(tmp_path, textured('token inputs:sourceColorSpace = "raw"') + mesh())
     assert scene.stats["texels"] <= 4 and warned(scene, "a.png", "averaged down")
 

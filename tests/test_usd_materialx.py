@@ -11,8 +11,8 @@ import warp_ir as ir
 from tests.test_usd_look import ST
 from tests.test_usd_material import QUADS, load, only_material, warned
 from tests.test_usd_texture import write
-from warp_ir.usd import materialx, redirect
-from warp_ir.usd.color import srgb_to_linear
+from warp_ir.usd.stage import materialx, mtlx_layers
+from warp_ir.usd.values.source_color_space import srgb_to_linear
 
 pytest.importorskip("MaterialX")
 
@@ -243,7 +243,7 @@ def test_odd_documents_are_survived(tmp_path, old, new):
 
 
 def test_without_the_package(looks, monkeypatch):
-    monkeypatch.setattr(redirect, "available", lambda: False)
+    monkeypatch.setattr(mtlx_layers, "available", lambda: False)
     assert warned(load(looks, ROOT + mesh()), "/: 1 .mtlx files cannot be read", "MaterialX is not installed")
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-import warp_ir.usd.subdivision
+import warp_ir.usd.geometry.subdivision
 from warp_ir import InputError
 from warp_ir.cli import main
-from warp_ir.usd.subdivide import INFINITE, Cage, Refinement, Scheme
+from warp_ir.usd.geometry.refine import INFINITE, Cage, Refinement, Scheme
 
 from .test_usd_mesh import SQUARE, area, area_vectors, load, mesh_text, volume, warned
 
@@ -369,7 +369,7 @@ def test_broken_surfaces_are_refined_or_dropped(tmp_path, scheme, faces):
 
 def test_too_fine_a_refinement_is_refused_before_it_is_made(tmp_path, monkeypatch):
     """The limit is for all surfaces together; the message names the prim and the remedy."""
-    monkeypatch.setattr(warp_ir.usd.subdivision, "_MOST_REFINED", 100)
+    monkeypatch.setattr(warp_ir.usd.geometry.subdivision, "_MOST_REFINED", 100)
     text = scheme_text(CUBE, CUBE_FACES, name="A") + scheme_text(CUBE, CUBE_FACES, name="B")
     assert len(load(tmp_path, text, complexity="medium").meshes) == 2
     with pytest.raises(InputError, match=r"/A: .* 192 triangles, more than 100: choose a lower complexity"):

@@ -6,7 +6,7 @@ import pytest
 from tests.test_usd_look import RAW, UNPACK, mesh, textured
 from tests.test_usd_material import load
 from tests.test_usd_texture import write
-from warp_ir.usd.tangents import smooth_tangents
+from warp_ir.usd.geometry.tangents import smooth_tangents
 
 FOLD = np.array([(0, 0, 0), (0, 0, -1), (1, 0, 0), (1, 0, -1), (0, 1, 0), (0, 1, -1)], float)
 TRIANGLES = np.array([[0, 2, 3], [0, 3, 1], [4, 0, 1], [4, 1, 5]])

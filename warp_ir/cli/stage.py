@@ -49,10 +49,10 @@ def stage_facts(reader: Any, moment: float | str | None = None) -> dict[str, Any
     """
     from pxr import UsdRender
 
-    from warp_ir.usd.camera import all_cameras
-    from warp_ir.usd.render_spec import render_settings_prims
-    from warp_ir.usd.report import Report
-    from warp_ir.usd.stage import quiet, time_code, up_axis
+    from warp_ir.usd.camera_prim import all_cameras
+    from warp_ir.usd.settings.render_spec import render_settings_prims
+    from warp_ir.usd.stage.open import quiet, time_code, up_axis
+    from warp_ir.usd.values.report import Report
 
     stage = reader.stage
     with quiet():

@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Light, Mesh, MeshLight
-from warp_ir.usd import value
-from warp_ir.usd.render_pass import includes
-from warp_ir.usd.report import Report
+from warp_ir.usd.settings.render_pass import includes
+from warp_ir.usd.values import read
+from warp_ir.usd.values.report import Report
 
 
 class Linking:
@@ -100,7 +100,7 @@ def _says(collection: Usd.CollectionAPI) -> bool:
 
 def _names_subsets(stage: Usd.Stage, collection: Usd.CollectionAPI) -> bool:
     """Whether a collection tells parts of a mesh apart."""
-    targets = (*value.targets(collection.GetIncludesRel()), *value.targets(collection.GetExcludesRel()))
+    targets = (*read.targets(collection.GetIncludesRel()), *read.targets(collection.GetExcludesRel()))
     return any(prim.IsA(UsdGeom.Subset) for path in targets if (prim := stage.GetPrimAtPath(path.GetPrimPath())))
 
 

@@ -11,18 +11,18 @@ import numpy as np
 from pxr import Tf, Usd, UsdLux
 
 from warp_ir.scene import InputError, Light, LightKind, Scene
-from warp_ir.usd.black import explain_blackness, explain_dark_lights
-from warp_ir.usd.camera import find_camera, framing_camera, read_camera, read_shutter, standing_camera
-from warp_ir.usd.gprim import Geometry, build_meshes
-from warp_ir.usd.images import Images
-from warp_ir.usd.light import LIGHTS, read_light
+from warp_ir.usd.assemble import Geometry, build_meshes
+from warp_ir.usd.camera_prim import find_camera, framing_camera, read_camera, read_shutter, standing_camera
+from warp_ir.usd.diagnose import explain_blackness, explain_dark_lights
+from warp_ir.usd.images.cache import Images
+from warp_ir.usd.lights.light import LIGHTS, read_light
 from warp_ir.usd.linking import Linking, link
-from warp_ir.usd.motion import Motion
-from warp_ir.usd.render_pass import find_render_pass
-from warp_ir.usd.render_spec import Product, RenderSpec, read_render_spec
-from warp_ir.usd.report import Report, Unreadable
-from warp_ir.usd.stage import first_message, open_stage, quiet, time_code, up_axis
-from warp_ir.usd.walk import Found, Site, walk
+from warp_ir.usd.settings.render_pass import find_render_pass
+from warp_ir.usd.settings.render_spec import Product, RenderSpec, read_render_spec
+from warp_ir.usd.stage.open import first_message, open_stage, quiet, time_code, up_axis
+from warp_ir.usd.time_varying import Motion
+from warp_ir.usd.traverse import Found, Site, walk
+from warp_ir.usd.values.report import Report, Unreadable
 
 _COUNTED = (
     "meshes",

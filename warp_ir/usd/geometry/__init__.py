@@ -1,0 +1,1 @@
+"""Geometry prims to triangles: meshes, implicit shapes, subdivision, skinning, instancing, velocities."""

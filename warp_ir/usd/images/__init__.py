@@ -1,0 +1,1 @@
+"""Image files to pixels, and what shading networks make of them."""

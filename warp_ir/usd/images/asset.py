@@ -1,0 +1,209 @@
+"""Image assets: bytes through USD's resolver, so that a .usdz works, decoded by OpenImageIO, in linear light.
+
+Whatever a file says of itself is checked before anything is allocated, and an image with more pixels than asked
+for is averaged down while it is read, a band of rows at a time.
+"""
+
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from pxr import Ar, Sdf
+
+from warp_ir.scene import Floats
+from warp_ir.usd.values.report import Unreadable
+from warp_ir.usd.values.source_color_space import color_space as named
+from warp_ir.usd.values.source_color_space import decoder, srgb_to_linear
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+MAX_PIXELS = 4096 * 4096
+"""An image with more is averaged down to at most so many."""
+_MAX_VALUES = 2**31
+"""Pixels times channels of the largest image that is decoded at all: beyond it is a mistake or an attack."""
+_BAND = 2**22
+"""Values decoded at once."""
+_RAW = {"linear", "lin_rec709", "lin_rec709_scene", "scene_linear", "raw", "data"}
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A decoded image."""
+
+    pixels: npt.NDArray[np.float32]
+    """float32 [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4 (rgb, alpha)."""
+    width: int
+    """In the file: `pixels` may be fewer."""
+    height: int
+    decoded: bool = False
+    """Whether colour was not linear in the file."""
+    wrap: tuple[str, str] = ("", "")
+    """Wrap modes in s and t that the file asks for: "black", "clamp", "repeat", "mirror", or "" if it does not."""
+
+    @property
+    def rgb(self) -> npt.NDArray[np.float32]:
+        """The colour, float32 [h, w, 3]; grey is spread over the channels."""
+        count = self.pixels.shape[2]
+        if count >= 3:
+            return self.pixels[..., :3]
+        return np.broadcast_to(self.pixels[..., :1], (*self.pixels.shape[:2], 3))
+
+    @property
+    def alpha(self) -> npt.NDArray[np.float32]:
+        """float32 [h, w]; 1 where the file has none."""
+        count = self.pixels.shape[2]
+        return self.pixels[..., count - 1] if count in (2, 4) else np.ones(self.pixels.shape[:2], np.float32)
+
+
+def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixels: int = MAX_PIXELS) -> Image:
+    """Reads an image asset.
+
+    Args:
+        asset: As an attribute gives it, resolved by USD; or a resolved path, which may lie in a package
+            (`a.usdz[b.png]`).
+        color_space: UsdUVTexture's sourceColorSpace: "raw", "sRGB", or "auto": sRGB for 8 bits and three or four
+            channels unless the file says otherwise; or another colour space, of which the primaries are kept. Only
+            colour is ever decoded, never alpha.
+        max_pixels: An image with more is averaged down by a whole factor.
+
+    Raises:
+        Unreadable: There is no such file, it is no image, or it is too large to be one; the message names the asset.
+    """
+    authored = asset if isinstance(asset, str) else asset.path
+    resolved = asset if isinstance(asset, str) else asset.resolvedPath
+    if not resolved:
+        raise Unreadable(f"image '{_short(authored)}' not found")
+    import OpenImageIO as oiio
+
+    with _file(resolved) as path:
+        # Values as stored: no reader may multiply colour by alpha.
+        hints = oiio.ImageSpec()
+        hints.attribute("oiio:UnassociatedAlpha", 1)
+        reader = None if path is None else oiio.ImageInput.open(path, hints)
+        try:
+            if path is None:
+                raise Unreadable("not found")
+            if reader is None:
+                raise Unreadable(f"cannot be read: {_first_line(oiio.geterror(), path)}")
+            return _decode(reader, path, color_space, max_pixels)
+        except Unreadable as trouble:
+            raise Unreadable(f"image '{_short(authored)}' {trouble}") from None
+        finally:
+            if reader is not None:
+                reader.close()
+
+
+@contextmanager
+def _file(resolved: str) -> "Iterator[str | None]":
+    """A path that OpenImageIO can open: the file itself, or a copy of the bytes if they lie in a package."""
+    if os.path.exists(resolved):  # but no pipe, device or folder
+        yield resolved if os.path.isfile(resolved) else None
+        return
+    opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
+    content = opened.GetBuffer() if opened else None
+    if content is None:
+        yield None
+        return
+    inner = Ar.SplitPackageRelativePathInner(resolved)[1] or resolved
+    # OpenImageIO's Python interface reads files only.
+    with tempfile.TemporaryDirectory(prefix="warp-ir-") as folder:
+        path = Path(folder) / f"image{Path(inner).suffix}"
+        path.write_bytes(content)
+        yield str(path)
+
+
+def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
+    import OpenImageIO as oiio
+
+    spec = reader.spec()
+    width, height, channels = int(spec.width), int(spec.height), int(spec.nchannels)
+    if min(width, height, channels) < 1 or spec.depth > 1 or spec.deep:
+        raise Unreadable("is not a flat picture of at least one pixel")
+    if width * height * channels > _MAX_VALUES:
+        raise Unreadable(f"claims {width} x {height} pixels of {channels} channels: too many")
+    first, count = _channels(list(spec.channelnames))
+    factor = max(1, math.isqrt(width * height // max_pixels))
+    while -(-width // factor) * -(-height // factor) > max_pixels:
+        factor += 1
+    # Bytes become light by a table.
+    bytes_only = spec.format.basetype == oiio.UINT8
+    decode = _decoder(spec, color_space, bytes_only)
+    colors = 0 if decode is None else count if count in (1, 3) else count - 1
+    table = None if decode is None else decode(np.arange(256) / 255.0).astype(np.float32)
+    small = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
+    tile = int(spec.tile_height) or 1
+    step = math.lcm(factor, tile)  # a band is whole rows of the result, and of tiles
+    rows = step * max(1, _BAND // (width * count * step))
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        y0, y1, kind = spec.y + top, spec.y + bottom, oiio.UINT8 if bytes_only else oiio.FLOAT
+        if spec.tile_width:
+            band = reader.read_tiles(0, 0, spec.x, spec.x + width, y0, y1, 0, 1, first, first + count, kind)
+        else:
+            band = reader.read_scanlines(0, 0, y0, y1, 0, first, first + count, kind)
+        if band is None:
+            raise Unreadable(f"cannot be read: {_first_line(reader.geterror(), path)}")
+        stored = np.asarray(band).reshape(bottom - top, width, count)
+        values = stored.astype(np.float32) / np.float32(255.0 if bytes_only else 1.0)
+        if decode is not None and table is not None:
+            values[..., :colors] = table[stored[..., :colors]] if bytes_only else decode(values[..., :colors])
+        small[top // factor : -(-bottom // factor)] = _averaged(values, factor)
+    if not np.isfinite(small).all():
+        small = np.nan_to_num(small, nan=0.0, posinf=65504.0, neginf=0.0)
+    return Image(small, width, height, decode is not None, _wrap_modes(spec))
+
+
+def _averaged(values: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:
+    """Means of squares of factor x factor pixels; what is left at the right and the bottom counts as it is."""
+    if factor == 1:
+        return values
+    down = np.arange(0, values.shape[0], factor)
+    across = np.arange(0, values.shape[1], factor)
+    sums = np.add.reduceat(np.add.reduceat(values, down, axis=0, dtype=np.float64), across, axis=1)
+    counts = np.minimum(down + factor, values.shape[0]) - down
+    widths = np.minimum(across + factor, values.shape[1]) - across
+    means: npt.NDArray[np.float32] = (sums / (counts[:, None] * widths)[..., None]).astype(np.float32)
+    return means
+
+
+def _channels(names: list[str]) -> tuple[int, int]:
+    """Where grey, rgb and alpha begin, and how many there are; other layers of an EXR are left alone."""
+    if {"R", "G", "B"} <= set(names):
+        first = names.index("R")
+        if names[first : first + 3] == ["R", "G", "B"]:
+            return first, 4 if names[first + 3 : first + 4] == ["A"] else 3
+    return 0, min(len(names), 4)
+
+
+def _decoder(spec: Any, color_space: str, bytes_only: bool) -> Callable[[Floats], Floats] | None:
+    """What makes colour linear; None if it is, or is no colour."""
+    if color_space != "auto":
+        space = named(color_space)
+        return None if space is None else decoder(space)
+    says = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
+    # OpenImageIO calls every PNG sRGB, whether the file does or not: only what the pixels are decides then.
+    return srgb_to_linear if says not in _RAW and bytes_only and spec.nchannels in (3, 4) else None
+
+
+def _wrap_modes(spec: Any) -> tuple[str, str]:
+    known = {"black": "black", "clamp": "clamp", "periodic": "repeat", "mirror": "mirror"}
+    modes = str(spec.get_string_attribute("wrapmodes")).lower().split(",")
+    s = known.get(modes[0].strip(), "")
+    return s, known.get(modes[-1].strip(), s)
+
+
+def _short(path: str) -> str:
+    return path if len(path) <= 120 else f"…{path[-119:]}"
+
+
+def _first_line(text: str, path: str) -> str:
+    lines = text.replace(path, "it").strip().splitlines()
+    return lines[0].strip() if lines else "unknown error"

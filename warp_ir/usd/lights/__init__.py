@@ -1,0 +1,1 @@
+"""UsdLux lights, and geometry that is a light."""

@@ -1,0 +1,1 @@
+"""RenderSettings, RenderProducts, RenderVars and RenderPass prims."""
