@@ -21,11 +21,11 @@ from make_references import PICTURES, ROOT
 from report import Table, environment, number, publish
 
 import warp_ir as ir
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
 from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
 from warp_ir.guide import unguided
-from warp_ir.launch import Launcher
 from warp_ir.surface import closest, visible
 from warp_ir.vpl import VplBuffer, emit_vpls
 

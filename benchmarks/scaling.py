@@ -25,7 +25,7 @@ from report import Table, environment, number, publish
 
 import warp_ir as ir
 from warp_ir import procedural
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 from warp_ir.renderer import Renderer
 
 SIZE = 10.0

@@ -21,6 +21,6 @@ def pytest_generate_tests(metafunc):
 @pytest.fixture(scope="session")
 def launcher():
     """Kernels on all CPU cores."""
-    from warp_ir.launch import Launcher
+    from warp_ir.device.launcher import Launcher
 
     return Launcher("cpu")

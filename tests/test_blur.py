@@ -7,7 +7,7 @@ import pytest
 
 import warp_ir as ir
 from warp_ir import procedural
-from warp_ir.sampling import stratum
+from warp_ir.sampling.sobol import stratum
 
 BLURRED = ir.RenderSettings(width=48, height=48, iterations=8, light_paths=512)
 

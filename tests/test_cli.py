@@ -20,7 +20,7 @@ from warp_ir.cli import compare, main
 from warp_ir.cli.arguments import parse, settings_of
 from warp_ir.cli.console import ProgressDisplay, describe_progress, say_warnings
 from warp_ir.cli.frames import outputs_of
-from warp_ir.image import AOV_CHANNELS, read_image
+from warp_ir.image.io import AOV_CHANNELS, read_image
 from warp_ir.scene import InputError
 
 ROOM = str(Path(__file__).parent.parent / "scenes_usd" / "cornell_box.usda")

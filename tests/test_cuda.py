@@ -16,8 +16,8 @@ import warp_ir as ir
 import warp_ir.estimators.vpl
 import warp_ir.vpl
 from tests.physics.test_invariance import room
+from warp_ir.device.launcher import MOST_REGISTERS
 from warp_ir.device_scene import SceneData
-from warp_ir.launch import MOST_REGISTERS
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
 

@@ -10,9 +10,9 @@ import pytest
 from pxr import Gf
 
 from warp_ir import InputError, RenderSettings
-from warp_ir.color_space import COLOR_SPACES, REC709, matrix
-from warp_ir.image import AOV_CHANNELS, check_output, read_image, whole_file, write_image
-from warp_ir.tonemap import srgb_from_linear
+from warp_ir.image.color_space import COLOR_SPACES, REC709, matrix
+from warp_ir.image.io import AOV_CHANNELS, check_output, read_image, whole_file, write_image
+from warp_ir.image.tonemap import srgb_from_linear
 
 HEIGHT, WIDTH = 5, 7
 

@@ -8,10 +8,11 @@ import warp as wp
 
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, render
-from warp_ir import sampling
 from warp_ir.device_scene import SceneData, upload_scene
 from warp_ir.placing import areas_of_copies, bounds_of_copies, place
 from warp_ir.procedural import cube, mesh, quad, sphere
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.scene import Instances, Texture
 from warp_ir.surface import albedo, closest, visible
 
@@ -150,7 +151,7 @@ def _look(first: int, scene: SceneData, seen: wp.array[wp.vec3], measured: wp.ar
     """A ray from near the lamp into the room: a texture's mean over a patch, depth and area, and the way back."""
     i = first + wp.tid()
     origin = wp.vec3(0.01, 0.1, 0.07)  # in the device's frame, in which the room's half size is 1/4
-    d = sampling.to_cone(sampling.sample_2d(scene.sobol, i, 0, wp.uint32(1)), 2.0, wp.vec3(0.0, 0.0, 1.0))
+    d = square_to_cone(sobol.sample_2d(scene.sobol, i, 0, wp.uint32(1)), 2.0, wp.vec3(0.0, 0.0, 1.0))
     hit = closest(scene, origin, d, 3.0e38)
     seen[i] = albedo(scene, hit, 0.005)
     measured[i] = wp.vec2(hit.t, hit.area)
@@ -242,7 +243,7 @@ def _wander(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: 
     """Six reflections inside a closed room."""
     i = first + wp.tid()
     origin = wp.vec3(0.01, 0.02, 0.03)
-    direction = sampling.to_cone(sampling.sample_2d(scene.sobol, i, 0, wp.uint32(1)), 2.0, wp.vec3(0.0, 0.0, 1.0))
+    direction = square_to_cone(sobol.sample_2d(scene.sobol, i, 0, wp.uint32(1)), 2.0, wp.vec3(0.0, 0.0, 1.0))
     for bounce in range(6):
         hit = closest(scene, origin, direction, 3.0e38)
         if hit.triangle < 0:
@@ -254,8 +255,8 @@ def _wander(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: 
         if visible(scene, origin, wp.vec4(direction[0], direction[1], direction[2], 0.0)):
             escapes[i] = 1
         origin = p
-        u = sampling.sample_2d(scene.sobol, i, 2 * bounce + 2, wp.uint32(1))
-        direction = sampling.to_cosine_hemisphere(u, hit.normal)
+        u = sobol.sample_2d(scene.sobol, i, 2 * bounce + 2, wp.uint32(1))
+        direction = square_to_cosine_hemisphere(u, hit.normal)
 
 
 @pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 10.0), (1e6, 1e11)])

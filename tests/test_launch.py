@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ir.launch import Cancelled, Launcher
+from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.scene import InputError
 
 wp.set_module_options({"enable_backward": False})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_ir import Camera, InputError, Projection, Scene
-from warp_ir.image import read_image
+from warp_ir.image.io import read_image
 from warp_ir.preview import dot_colors, picture_vpls
 from warp_ir.procedural import cornell_box
 

@@ -12,7 +12,7 @@ import pytest
 
 import warp_ir as ir
 from warp_ir.cli import main
-from warp_ir.image import read_image
+from warp_ir.image.io import read_image
 
 SCENES = Path(__file__).parent.parent / "scenes_usd"
 ROOM = str(SCENES / "cornell_box.usda")
@@ -122,7 +122,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path, capsys):
 
 def test_a_full_disk_does_not_stop_the_render(tmp_path, capsys, monkeypatch):
     """A checkpoint that cannot be written is a warning, once; the picture is rendered."""
-    from warp_ir.film import Film
+    from warp_ir.film.film import Film
 
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")

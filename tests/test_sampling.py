@@ -6,7 +6,8 @@ import warp as wp
 from scipy import stats
 from scipy.stats import qmc
 
-from warp_ir import sampling
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere, square_to_disk
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,28 +15,28 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def _draw(first: int, m: wp.array[wp.uint32], dimension: int, scramble: wp.uint32, out: wp.array[wp.float32]):
     i = first + wp.tid()
-    out[i] = sampling.sample_1d(m, i, dimension, scramble)
+    out[i] = sobol.sample_1d(m, i, dimension, scramble)
 
 
 @wp.kernel
 def _draw_first(first: int, m: wp.array[wp.uint32], dimension: int, out: wp.array[wp.float32]):
     i = first + wp.tid()
-    out[i] = sampling.sample_1d(m, 0, dimension, sampling.hash_combine(wp.uint32(7), wp.uint32(i)))
+    out[i] = sobol.sample_1d(m, 0, dimension, sobol.hash_combine(wp.uint32(7), wp.uint32(i)))
 
 
 @wp.kernel
 def _warp(first: int, m: wp.array[wp.uint32], n: wp.vec3, cone: float, out: wp.array2d[wp.vec3]):
     i = first + wp.tid()
-    u = sampling.sample_2d(m, i, 0, wp.uint32(7))
-    d = sampling.to_disk(u)
+    u = sobol.sample_2d(m, i, 0, wp.uint32(7))
+    d = square_to_disk(u)
     out[0, i] = wp.vec3(d[0], d[1], 0.0)
-    out[1, i] = sampling.to_cosine_hemisphere(u, n)
-    out[2, i] = sampling.to_cone(u, cone, n)
+    out[1, i] = square_to_cosine_hemisphere(u, n)
+    out[2, i] = square_to_cone(u, cone, n)
 
 
 @pytest.fixture(scope="module")
 def draw(launcher):
-    matrices = launcher.array(sampling.sobol_matrices(), wp.uint32)
+    matrices = launcher.array(sobol.sobol_matrices(), wp.uint32)
 
     def draw(count, dimension, scramble):
         out = launcher.empty(count, wp.float32)
@@ -47,11 +48,11 @@ def draw(launcher):
 
 def test_matrices_are_sobols():
     """Unscrambled, the first 256 points are SciPy's (which visits each block of 2^k in Gray-code order)."""
-    columns = sampling.sobol_matrices().reshape(sampling.SOBOL_DIMENSIONS, 32)
+    columns = sobol.sobol_matrices().reshape(sobol.SOBOL_DIMENSIONS, 32)
     bits = (np.arange(256)[:, None] >> np.arange(32)) & 1
     words = np.bitwise_xor.reduce(np.where(bits[:, None, :] == 1, columns[None], 0), axis=2)
     points = np.array([[int(f"{w:032b}"[::-1], 2) for w in row] for row in words]) / 2.0**32
-    theirs = qmc.Sobol(sampling.SOBOL_DIMENSIONS, scramble=False).random(256)
+    theirs = qmc.Sobol(sobol.SOBOL_DIMENSIONS, scramble=False).random(256)
     assert {tuple(p) for p in points} == {tuple(p) for p in theirs}
 
 
@@ -80,7 +81,7 @@ def test_coordinates_are_independent(launcher, dimensions):
 
     A path tracer that starts every pixel at point 0 lives on this alone.
     """
-    matrices = launcher.array(sampling.sobol_matrices(), wp.uint32)
+    matrices = launcher.array(sobol.sobol_matrices(), wp.uint32)
     cell = np.zeros(1 << 20, int)
     for dimension in dimensions:
         out = launcher.empty(len(cell), wp.float32)
@@ -113,7 +114,7 @@ def test_warps(launcher, normal):
     n, cone = 4096, 0.3
     axis = np.array(normal, np.float64)
     out = launcher.empty((3, n), wp.vec3)
-    matrices = launcher.array(sampling.sobol_matrices(), wp.uint32)
+    matrices = launcher.array(sobol.sobol_matrices(), wp.uint32)
     launcher.launch(_warp, n, [matrices, wp.vec3(*normal), cone, out])
     disk, cosine, cap = out.numpy().astype(np.float64)
     slack = 5 / (4 * np.sqrt(n))

@@ -8,8 +8,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from tests.physics.closed_form import unit_shape
+from warp_ir.sampling.solid_angle import aim_at, aim_density
 from warp_ir.scene import LightKind
-from warp_ir.solid_angle import aim_at, aim_density
 
 wp.set_module_options({"enable_backward": False})
 

@@ -5,9 +5,10 @@ import pytest
 import warp as wp
 
 import warp_ir as ir
-from warp_ir import sampling
 from warp_ir.device_scene import SceneData, upload_scene
 from warp_ir.procedural import cube, mesh, sphere
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.surface import closest, visible
 
 wp.set_module_options({"enable_backward": False})
@@ -17,13 +18,13 @@ wp.set_module_options({"enable_backward": False})
 def _bounce(first: int, scene: SceneData, origin: wp.vec3, self_hits: wp.array[wp.int32], escapes: wp.array[wp.int32]):
     """From inside, to a surface, and from there into the half-space behind it: nothing but that surface is there."""
     i = first + wp.tid()
-    u = sampling.sample_2d(scene.sobol, i, 0, wp.uint32(1))
-    hit = closest(scene, origin, sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0)), 3.0e38)
+    u = sobol.sample_2d(scene.sobol, i, 0, wp.uint32(1))
+    hit = closest(scene, origin, square_to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0)), 3.0e38)
     if hit.triangle < 0:
         escapes[i] = 1
     else:
-        v = sampling.sample_2d(scene.sobol, i, 2, wp.uint32(1))
-        out = sampling.to_cosine_hemisphere(v, hit.normal)
+        v = sobol.sample_2d(scene.sobol, i, 2, wp.uint32(1))
+        out = square_to_cosine_hemisphere(v, hit.normal)
         onward = closest(scene, hit.position, out, 3.0e38)
         if onward.triangle == hit.triangle:
             self_hits[i] = 1
@@ -83,7 +84,7 @@ def test_empty_and_degenerate_meshes_render(triangles):
 
 def test_a_picture_too_large_for_the_memory_is_refused(monkeypatch):
     """Before anything is allocated, with the size it would need and the size there is."""
-    from warp_ir.launch import Launcher
+    from warp_ir.device.launcher import Launcher
 
     monkeypatch.setattr(Launcher, "memory", lambda self: 2.0**30)
     with pytest.raises(ir.InputError, match=r"4000 x 4000 pixels need about 4 GiB, cpu has 1"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ir.mipmap import mip_chain, resized
+from warp_ir.image.mipmap import mip_chain, resized
 from warp_ir.scene import Texture, Wrap
 from warp_ir.texture import TextureTable, coordinates, lookup, mean_on_triangles, mip_level, upload_textures
 

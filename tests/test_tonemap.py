@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from warp_ir import InputError
-from warp_ir.tonemap import filmic, srgb_from_linear, suggest_exposure, tone_map
+from warp_ir.image.tonemap import filmic, srgb_from_linear, suggest_exposure, tone_map
 from warp_ir.usd.values.source_color_space import srgb_to_linear
 
 

@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from warp_ir import InputError, Scene, load_usd
-from warp_ir.image import write_image
+from warp_ir.image.io import write_image
 from warp_ir.usd.load import StageReader
 
 TRIANGLE = """
@@ -584,7 +584,7 @@ import warp_ir as ir
 start = time.perf_counter()
 scene = ir.load_usd({str(tmp_path / "many.usdc")!r})
 from warp_ir.device_scene import upload_scene
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 upload_scene(scene, Launcher("cpu"))
 print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """

@@ -16,7 +16,7 @@ from tests.test_usd_texture import write
 from warp_ir import InputError, RenderSettings, load_usd
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse
-from warp_ir.image import read_image
+from warp_ir.image.io import read_image
 from warp_ir.usd.load import StageReader
 
 FEW = ["--iterations", "1", "--light-paths", "16", "--device", "cpu", "-q"]

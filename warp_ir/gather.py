@@ -17,9 +17,9 @@ from typing import Any
 import warp as wp
 
 from warp_ir.bvh import on_cuda
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import SceneData
 from warp_ir.guide import Guide
-from warp_ir.launch import Launcher
 from warp_ir.light_control import emphasis
 from warp_ir.lights import Bound, arriving, bound_on
 from warp_ir.surface import scene_at

@@ -9,10 +9,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher, carve, floats
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.launch import MOST_REGISTERS, Launcher, carve, floats
 from warp_ir.lights import lights_found, surface_seen
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_disk
 from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, smooth_rise
 from warp_ir.tiles import Tiles, all_tiles, indices, missed_at, pixel_at
 
@@ -182,14 +183,14 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
 
 @wp.func
 def _jitter_scramble(camera: CameraData, pixel: int, seed: wp.uint32) -> wp.uint32:
-    stream = sampling.hash_combine(seed, wp.uint32(image_pixel(camera, pixel)))
-    return sampling.hash_combine(stream, _JITTER)
+    stream = sobol.hash_combine(seed, wp.uint32(image_pixel(camera, pixel)))
+    return sobol.hash_combine(stream, _JITTER)
 
 
 @wp.func
 def jitter(scene: SceneData, camera: CameraData, pixel: int, iteration: int, seed: wp.uint32) -> wp.vec2:
     """Where in a pixel an iteration looks, in [0, 1)²."""
-    return sampling.sample_2d(scene.sobol, iteration, 0, _jitter_scramble(camera, pixel, seed))
+    return sobol.sample_2d(scene.sobol, iteration, 0, _jitter_scramble(camera, pixel, seed))
 
 
 @wp.func
@@ -197,7 +198,7 @@ def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int,
     """Where on the lens, in the unit disk, an iteration's ray through a pixel starts."""
     if camera.lens_radius <= 0.0:
         return wp.vec2(0.0, 0.0)
-    return sampling.to_disk(sampling.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
+    return square_to_disk(sobol.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
 
 
 @wp.kernel(cuda_max_registers=MOST_REGISTERS)

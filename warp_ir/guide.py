@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.launch import Launcher
 from warp_ir.lights import Aim
 
 wp.set_module_options({"enable_backward": False})

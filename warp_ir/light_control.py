@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.grid import GridList, GridTables, cell_means, cell_measure, value_along
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
+from warp_ir.sampling.distribution2d import GridList, GridTables, cell_means, cell_measure, value_along
 from warp_ir.scene import InputError, Light, LightKind, Mesh, MeshLight, Shaping
 
 wp.set_module_options({"enable_backward": False})

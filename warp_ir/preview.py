@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.image import check_output, whole_file
+from warp_ir.image.io import check_output, whole_file
 from warp_ir.scene import Camera, InputError, Projection, Scene
 
 _DECADES = 4.0

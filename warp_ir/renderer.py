@@ -26,7 +26,7 @@ import warp_ir.bvh.build
 import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
-import warp_ir.film_data
+import warp_ir.film.accumulate
 import warp_ir.gather
 import warp_ir.gbuffer
 import warp_ir.reconstruction.blur
@@ -35,15 +35,15 @@ import warp_ir.reconstruction.filter
 import warp_ir.reconstruction.observations
 import warp_ir.vpl
 from warp_ir.cost import pixel_bytes
-from warp_ir.denoise import denoise_seconds
+from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
 from warp_ir.estimators import ESTIMATORS
-from warp_ir.film import Film
+from warp_ir.film.denoise import denoise_seconds
+from warp_ir.film.film import Film
 from warp_ir.gbuffer import new_gbuffer
 from warp_ir.guide import unguided
-from warp_ir.launch import Cancelled, Launcher
 from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
-from warp_ir.sampling import iteration_scramble, stratum
+from warp_ir.sampling.sobol import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 from warp_ir.stopping import Progress, Stopping
@@ -291,12 +291,12 @@ def _modules(estimator: str) -> tuple[list[Any], list[Any]]:
         return [warp_ir.gbuffer, warp_ir.vpl], [
             *reconstruction,
             warp_ir.gather,
-            warp_ir.film_data,
+            warp_ir.film.accumulate,
             warp_ir.reconstruction.compose,
         ]
     if estimator == "keller":
-        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film_data]
-    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film_data]
+        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film.accumulate]
+    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film.accumulate]
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from warp_ir.color_space import COLOR_SPACES, REC709
+from warp_ir.image.color_space import COLOR_SPACES, REC709
 from warp_ir.scene import CONFORM_POLICIES, InputError
 
 ESTIMATOR_NAMES = ("vpl", "keller", "path")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.film import Film
+from warp_ir.film.film import Film
 from warp_ir.settings import RenderSettings
 
 _FEWEST = 2

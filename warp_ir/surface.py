@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ir.bvh import RayHit, intersect, intersect_instances
 from warp_ir.device_scene import INSTANCE_COLOR, Patterns, SceneData
-from warp_ir.sampling import hash_combine
+from warp_ir.sampling.sobol import hash_combine
 from warp_ir.texture import coordinates, lookup, mip_level
 
 wp.set_module_options({"enable_backward": False})

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.launch import Launcher
-from warp_ir.mipmap import mip_chain, resized
+from warp_ir.device.launcher import Launcher
+from warp_ir.image.mipmap import mip_chain, resized
 from warp_ir.scene import Floats, Texture, Wrap
 
 wp.set_module_options({"enable_backward": False})

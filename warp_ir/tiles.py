@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -17,11 +17,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.guide import Guide, Worth, kept_probability
-from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import Aim, emit, land, sample_light
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.surface import albedo, closest, scene_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -85,8 +86,8 @@ class PathSettings:
 @wp.func
 def _coin(scramble: wp.uint32, path: int, bounce: int) -> float:
     """Uniform in [0, 1), for every VPL."""
-    bits = sampling.hash_combine(sampling.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
-    return sampling.to_unit(bits)
+    bits = sobol.hash_combine(sobol.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
+    return sobol.to_unit(bits)
 
 
 @wp.func
@@ -97,7 +98,7 @@ def _row(settings: PathSettings, number: int, total: int) -> int:
     """
     if total <= settings.room:
         return settings.on_lights + number
-    offset = sampling.hash_combine(settings.scramble ^ _THINNING, wp.uint32(0)) % wp.uint32(total)
+    offset = sobol.hash_combine(settings.scramble ^ _THINNING, wp.uint32(0)) % wp.uint32(total)
     before = (wp.int64(number) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
     after = (wp.int64(number + 1) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
     return wp.where(after > before, settings.on_lights + int(before), -1)
@@ -129,8 +130,8 @@ def _follow(
     follow in steps. VPL j is stored if kept < j <= most.
     """
     scene = scene_at(address)[0]
-    u_pick = sampling.sample_1d(scene.sobol, i, 2, settings.scramble)
-    u = sampling.sample_2d(scene.sobol, i, 0, settings.scramble)
+    u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble)
+    u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     share = 1.0 / float(settings.paths)
     if kept == 0 and i < settings.on_lights:
@@ -146,8 +147,8 @@ def _follow(
         scene,
         light,
         settings.aim,
-        sampling.sample_2d(scene.sobol, i, 3, settings.scramble),
-        sampling.sample_2d(scene.sobol, i, 5, settings.scramble),
+        sobol.sample_2d(scene.sobol, i, 3, settings.scramble),
+        sobol.sample_2d(scene.sobol, i, 5, settings.scramble),
     )
     origin = photon.origin
     direction = photon.direction
@@ -158,7 +159,7 @@ def _follow(
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
         if bounce == 1 and light.control >= 0:
-            coin = sampling.sample_1d(scene.sobol, i, _LANDING_DIMENSION, settings.scramble)
+            coin = sobol.sample_1d(scene.sobol, i, _LANDING_DIMENSION, settings.scramble)
             landing = land(scene, light.control, hit, direction, coin)
             hit = landing.hit
             flux = flux * landing.weight
@@ -172,7 +173,7 @@ def _follow(
             flux = wp.cw_mul(flux, rho)
         else:
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
-            if sampling.sample_1d(scene.sobol, i, dimension + 2, settings.scramble) >= survival:
+            if sobol.sample_1d(scene.sobol, i, dimension + 2, settings.scramble) >= survival:
                 break
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
@@ -193,8 +194,8 @@ def _follow(
                     vpls.intensity[row] = intensity * _stands_for(settings, total)
                     vpls.bounce[row] = bounce
         origin = hit.position
-        u = sampling.sample_2d(scene.sobol, i, dimension, settings.scramble)
-        direction = sampling.to_cosine_hemisphere(u, hit.normal)
+        u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
+        direction = square_to_cosine_hemisphere(u, hit.normal)
         dimension += 3
         bounce += 1
     return left

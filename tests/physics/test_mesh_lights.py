@@ -19,9 +19,9 @@ from tests.physics.test_light_control import (
     pixels,
     sky_texture,
 )
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_scene
 from warp_ir.estimators import ESTIMATORS
-from warp_ir.launch import Launcher
 from warp_ir.procedural import cube, floor, mesh, quad, sphere
 from warp_ir.scene import LightKind, Shaping
 

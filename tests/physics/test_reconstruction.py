@@ -132,7 +132,7 @@ def test_time_for_the_denoiser_is_kept(monkeypatch):
 def test_the_denoiser_hurries_where_time_is_short():
     """The smaller network is for pictures whose time the larger one would use up."""
     pytest.importorskip("pyoidn")
-    from warp_ir.denoise import denoise_seconds
+    from warp_ir.film.denoise import denoise_seconds
 
     full = denoise_seconds(10**5)
     assert denoise_seconds(10**5, 100.0 * full) == full

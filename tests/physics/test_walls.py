@@ -7,10 +7,11 @@ import pytest
 import warp as wp
 
 import warp_ir as ir
-from warp_ir import sampling
 from warp_ir.device_scene import SceneData, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cube, mesh
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.scene import LightKind
 from warp_ir.surface import closest
 
@@ -21,17 +22,17 @@ wp.set_module_options({"enable_backward": False})
 def _walk(first: int, scene: SceneData, axis: wp.vec3, wall: float, escaped: wp.array[wp.int32]):
     """Counts the reflections until a diffuse walk from the middle is where it cannot be; 0 if it never is."""
     i = first + wp.tid()
-    scramble = sampling.hash_combine(wp.uint32(7), wp.uint32(i))
+    scramble = sobol.hash_combine(wp.uint32(7), wp.uint32(i))
     position = wp.vec3(0.0)
-    direction = sampling.to_cone(sampling.sample_2d(scene.sobol, 0, 0, scramble), 2.0, axis)
+    direction = square_to_cone(sobol.sample_2d(scene.sobol, 0, 0, scramble), 2.0, axis)
     for bounce in range(30):
         hit = closest(scene, position, direction, 3.0e38)
         if hit.triangle < 0 or wp.dot(hit.position, axis) > wall * 1.00001:
             escaped[i] = bounce + 1
             break
         position = hit.position
-        u = sampling.sample_2d(scene.sobol, 0, 2 * bounce + 2, scramble)
-        direction = sampling.to_cosine_hemisphere(u, hit.normal)
+        u = sobol.sample_2d(scene.sobol, 0, 2 * bounce + 2, scramble)
+        direction = square_to_cosine_hemisphere(u, hit.normal)
 
 
 @pytest.mark.parametrize("seed", [4, pytest.param(1, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow)])

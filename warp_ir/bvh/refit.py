@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ir.bvh.layout import INFINITY, Bvh
 from warp_ir.bvh.warp_tree import box_corner
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -12,10 +12,10 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 from warp_ir import __version__
-from warp_ir.image import AOV_CHANNELS
+from warp_ir.image.io import AOV_CHANNELS
+from warp_ir.image.tonemap import TONEMAPS
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
-from warp_ir.tonemap import TONEMAPS
 
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
 _ONLY_PICTURES = {

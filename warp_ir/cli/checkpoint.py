@@ -13,7 +13,7 @@ import numpy as np
 
 from warp_ir import __version__
 from warp_ir.cli.console import say
-from warp_ir.image import whole_file
+from warp_ir.image.io import whole_file
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 

@@ -21,9 +21,9 @@ from warp_ir.cli.device import open_device
 from warp_ir.cli.frames import Moment, outputs_of, time_codes
 from warp_ir.cli.importing import importing
 from warp_ir.cli.stage import moment_of, open_reader
-from warp_ir.image import SUFFIXES, check_output, whole_file, write_image
+from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
+from warp_ir.image.tonemap import suggest_exposure
 from warp_ir.scene import InputError
-from warp_ir.tonemap import suggest_exposure
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.materials import LARGEST_UV
 from warp_ir.device_scene.records import TRIANGLE_EMITTER
-from warp_ir.launch import Launcher
 from warp_ir.light_control import shaped_power
 from warp_ir.scene import Light, LightKind, Mesh, Scene
 from warp_ir.texture import mean_on_triangles

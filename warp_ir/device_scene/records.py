@@ -3,8 +3,8 @@
 import warp as wp
 
 from warp_ir.bvh import Bvh, Instance, TwoLevel
-from warp_ir.grid import GridTables
 from warp_ir.light_control import ControlTables
+from warp_ir.sampling.distribution2d import GridTables
 from warp_ir.scene import LightKind
 from warp_ir.texture import TextureTable
 

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.bvh import Trees, TwoLevel
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.corners import corner_tables
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.instances import InstanceTables, upload_instances
@@ -15,7 +16,6 @@ from warp_ir.device_scene.materials import LARGEST_UV, upload_materials
 from warp_ir.device_scene.records import INSTANCE_COLOR, Patterns
 from warp_ir.device_scene.storage import Layout, Part
 from warp_ir.device_scene.table import Table
-from warp_ir.launch import Launcher
 from warp_ir.scene import Scene, Texture
 from warp_ir.texture import upload_textures
 

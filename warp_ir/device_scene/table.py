@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 
 
 class Table:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.device.launcher import Launcher, copied
 from warp_ir.device_scene.check import check_scene
 from warp_ir.device_scene.emitters import upload_emitters
 from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
@@ -16,8 +16,8 @@ from warp_ir.device_scene.lights import upload_lights
 from warp_ir.device_scene.records import SceneData
 from warp_ir.device_scene.storage import arranged
 from warp_ir.device_scene.surfaces import Surfaces, same_objects
-from warp_ir.grid import GridList
-from warp_ir.launch import Launcher, copied
+from warp_ir.sampling import sobol
+from warp_ir.sampling.distribution2d import GridList
 from warp_ir.scene import InputError, Scene, materials_of
 
 _PATCHES = 2**14
@@ -139,7 +139,7 @@ def _upload(
         owners = surfaces.fill(k, data)
         rows = surfaces.rows(k)
         upload_emitters(stored[k][0], rows, gain, frame, data, launcher)
-        data.sobol = launcher.array(sampling.sobol_matrices(), wp.uint32)
+        data.sobol = launcher.array(sobol.sobol_matrices(), wp.uint32)
         itself = launcher.empty(1, SceneData)
         data.address = wp.uint64(itself.ptr)  # in the copy as well: what is called by address hands it on
         itself.assign(launcher.array([data], SceneData))

@@ -8,11 +8,11 @@ way of surfaces. What it computes depends on these arguments alone.
 
 from typing import Any, Protocol
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
 from warp_ir.estimators.keller import Keller
 from warp_ir.estimators.path import PathTracer
 from warp_ir.estimators.vpl import VplGatherer
-from warp_ir.launch import Launcher
 from warp_ir.settings import RenderSettings
 
 

@@ -12,11 +12,12 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
-from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sample_arrival, surface_found
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
@@ -69,7 +70,7 @@ def _trace_paths(
     once = wp.vec3(0.0)
     more = wp.vec3(0.0)
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
-        stream = sampling.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
+        stream = sobol.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
         position = gbuffer.position[pixel]
         normal = gbuffer.normal[pixel]
         shading_normal = gbuffer.shading_normal[pixel]
@@ -78,15 +79,15 @@ def _trace_paths(
         bounce = int(0)  # reflections between this vertex's light and the camera, less one
         dimension = int(0)
         while wp.max(throughput) > 0.0:
-            u = sampling.sample_1d(scene.sobol, 0, dimension, stream)
-            u2 = sampling.sample_2d(scene.sobol, 0, dimension + 1, stream)
+            u = sobol.sample_1d(scene.sobol, 0, dimension, stream)
+            u2 = sobol.sample_2d(scene.sobol, 0, dimension + 1, stream)
             light = sample_arrival(scene, position, u, u2)
             lit = _reflected(scene, position, normal, shading_normal, mesh, bounce == 0, light)
             found = wp.cw_mul(throughput, lit)
 
             # The way on: lights it meets count here, the surface it meets is the next vertex.
-            u2 = sampling.sample_2d(scene.sobol, 0, dimension + 3, stream)
-            direction = sampling.to_cosine_hemisphere(u2, shading_normal)
+            u2 = sobol.sample_2d(scene.sobol, 0, dimension + 3, stream)
+            direction = square_to_cosine_hemisphere(u2, shading_normal)
             above = wp.dot(direction, normal) > 0.0
             density = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
             hit = closest(scene, position, direction, 3.0e38)
@@ -106,7 +107,7 @@ def _trace_paths(
                 break
             rho = albedo(scene, hit, scene.footprint)
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
-            if sampling.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
+            if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
                 break
             throughput = wp.cw_mul(throughput, rho) / survival
             position = hit.position
@@ -138,7 +139,7 @@ class PathTracer:
                     self._scene.data,
                     self._camera,
                     gbuffer,
-                    wp.uint32(sampling.iteration_scramble(settings.seed, iteration)),
+                    wp.uint32(sobol.iteration_scramble(settings.seed, iteration)),
                     settings.bounce_limit,
                     direct,
                     indirect,

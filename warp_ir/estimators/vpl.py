@@ -17,14 +17,15 @@ from typing import Any
 import warp as wp
 
 import warp_ir.pilot.probes
-from warp_ir import sampling
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gather import ON_LIGHTS, ON_SURFACES, Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.guide import Guide, unguided
-from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.lights import cut_share, lights_beyond, surface_beyond
 from warp_ir.pilot import can_pay, learn
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
@@ -101,7 +102,7 @@ def _gather_pixels(
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
         index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
         # Neighbours weigh different sets, as any coordinate of a point: nothing else that is sampled hangs on which.
-        which = sampling.sample_1d(scene.sobol, index, 0, settings.scramble)
+        which = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
         x = _first_receiver(gbuffer, pixel)
         throughput = wp.vec3(1.0)
         bound = parts[ON_LIGHTS].bound  # the same for both
@@ -109,7 +110,7 @@ def _gather_pixels(
         depth = int(0)
         rays = settings.rays
         while depth <= settings.max_bounces:
-            u = sampling.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
+            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
             bounces = settings.max_bounces - depth
             by_lights = gather(scene.address, parts, ON_LIGHTS, which, x, u[0], rays[0], bounces)
             by_surfaces = gather(scene.address, parts, ON_SURFACES, which, x, u[1], rays[1], bounces)
@@ -119,8 +120,8 @@ def _gather_pixels(
             else:
                 more += wp.cw_mul(throughput, by_lights + by_surfaces)
 
-            v = sampling.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
-            direction = sampling.to_cosine_hemisphere(v, x.shading_normal)
+            v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
+            direction = square_to_cosine_hemisphere(v, x.shading_normal)
             if wp.dot(direction, x.normal) <= 0.0:
                 break
             cosine = wp.dot(direction, x.shading_normal)
@@ -173,7 +174,7 @@ class VplGatherer:
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
         settings, launcher = self._settings, self._launcher
-        scramble = sampling.iteration_scramble(settings.seed, iteration)
+        scramble = sobol.iteration_scramble(settings.seed, iteration)
 
         def look() -> None:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from warp_ir import sampling
 from warp_ir.device_scene import SceneData
-from warp_ir.grid import cell_direction, sample_cell
 from warp_ir.light_control import linked, shaping_factor
 from warp_ir.lights.arriving import CROSSINGS, behind
 from warp_ir.lights.points import LightPoint
+from warp_ir.sampling.distribution2d import cell_direction, sample_cell
+from warp_ir.sampling.square_to import from_local, square_to_cone, square_to_cosine_hemisphere, square_to_disk
 from warp_ir.surface import Hit, closest, scene_at
 
 wp.set_module_options({"enable_backward": False})
@@ -43,23 +43,23 @@ def emit(scene: SceneData, point: LightPoint, aim: Aim, u: wp.vec2, v: wp.vec2) 
         # Parallel light enters through a disk that covers the scene, seen from there.
         out.direction = -xyz
         if aim.rings == 0:
-            d = sampling.to_disk(v)
-            out.origin = scene.centre + scene.radius * (sampling.to_frame(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
+            d = square_to_disk(v)
+            out.origin = scene.centre + scene.radius * (from_local(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
             out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
         else:
             entry = _aimed(aim, scene.emitter_item[point.emitter], v)
             focus = aim.focus[scene.emitter_item[point.emitter]]
-            away = sampling.to_frame(wp.vec3(entry[0], entry[1], 0.0), xyz)
+            away = from_local(wp.vec3(entry[0], entry[1], 0.0), xyz)
             out.origin = wp.vec3(focus[0], focus[1], focus[2]) + away
             out.origin += (scene.radius - wp.dot(out.origin - scene.centre, xyz)) * xyz
             out.flux = point.intensity * entry[2]
     elif point.normal[3] == 1.0:
         out.origin = xyz
-        out.direction = sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
+        out.direction = square_to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
         out.flux = point.intensity * (4.0 * wp.pi)
     else:
         out.origin = xyz
-        out.direction = sampling.to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
+        out.direction = square_to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
         out.flux = point.intensity * wp.pi
     if point.control >= 0:
         out = _shaped(scene.address, point, u, out)

@@ -7,9 +7,7 @@ surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gat
 
 import warp as wp
 
-from warp_ir import sampling
 from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
-from warp_ir.grid import cell_direction, cell_place, sample_cell, value_along, value_at_place
 from warp_ir.lights.arriving import only_sampled
 from warp_ir.lights.shape import (
     area_scale,
@@ -21,6 +19,8 @@ from warp_ir.lights.shape import (
     unit_area,
     world_from_dome,
 )
+from warp_ir.sampling.distribution2d import cell_direction, cell_place, sample_cell, value_along, value_at_place
+from warp_ir.sampling.square_to import square_to_cone, square_to_disk
 from warp_ir.scene import LightKind
 from warp_ir.surface import emitted, offset, presence, scene_at
 
@@ -148,10 +148,10 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
         radiance = wp.cw_mul(radiance, value_at_place(scene.light_tables[0].grids, texture, place))
         q = wp.vec3(0.5 - place[0], 0.5 - place[1], 0.0)
     if kind == _DISK:
-        d = sampling.to_disk(u)
+        d = square_to_disk(u)
         q = wp.vec3(d[0], d[1], 0.0)
     elif kind == _SPHERE:
-        n = sampling.to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
+        n = square_to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
         q = n
     elif kind == _CYLINDER:
         phi = 2.0 * wp.pi * u[1]
@@ -194,7 +194,7 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
     cone = float(2.0)
     if kind == _DISTANT:
         cone = scene.light_angle[light]
-    d = sampling.to_cone(u, cone, light_axis(scene, light))
+    d = square_to_cone(u, cone, light_axis(scene, light))
     out.position = wp.vec4(d[0], d[1], d[2], 0.0)
     if cone > 0.0:
         out.density = probability / (2.0 * wp.pi * cone)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.grid import value_at_place
+from warp_ir.sampling.distribution2d import value_at_place
 from warp_ir.scene import LightKind
 
 wp.set_module_options({"enable_backward": False})

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
 from warp_ir.guide import Guide, unguided
-from warp_ir.launch import Launcher
 from warp_ir.pilot.emitters import choose_emitters
 from warp_ir.pilot.probes import connect, look
 from warp_ir.pilot.rings import aim_at_foci

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ir.device.launcher import Launcher, copied
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.launch import Launcher, copied
 from warp_ir.pilot.probes import Sightings
 
 Floats = npt.NDArray[np.float64]

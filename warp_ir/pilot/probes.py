@@ -8,12 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher, copied
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
 from warp_ir.guide import CELLS, Guide, cell_of
-from warp_ir.launch import MOST_REGISTERS, Launcher, copied
 from warp_ir.lights import arriving, choose_emitter, sample_arrival
+from warp_ir.sampling import sobol
+from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest, visible
 from warp_ir.vpl import VplBuffer, emit_vpls
@@ -74,8 +75,8 @@ def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, f
         for j in range(_ASKED_COUNT):
             row = (i * _VERTEX_COUNT + k) * _ASKED_COUNT + j
             number = i * _ASKED_COUNT + j
-            pick = sampling.sample_1d(scene.sobol, number, dimension, scramble)
-            u = sampling.sample_2d(scene.sobol, number, dimension + 1, scramble)
+            pick = sobol.sample_1d(scene.sobol, number, dimension, scramble)
+            u = sobol.sample_2d(scene.sobol, number, dimension + 1, scramble)
             light = sample_arrival(scene, position, pick, u)
             found.emitter[row] = choose_emitter(scene, pick).emitter
             found.position[row] = position
@@ -88,14 +89,14 @@ def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, f
                 gives = wp.cw_mul(throughput, wp.cw_mul(light.radiance, arrives)) * (cosine / wp.pi)
                 found.score[row] = (gives[0] + gives[1] + gives[2]) * (1.0 / 3.0)
 
-        direction = sampling.to_cosine_hemisphere(
-            sampling.sample_2d(scene.sobol, i, dimension + 3, scramble), shading_normal
+        direction = square_to_cosine_hemisphere(
+            sobol.sample_2d(scene.sobol, i, dimension + 3, scramble), shading_normal
         )
         hit = closest(scene, position, direction, 3.0e38)
         if hit.triangle < 0 or wp.dot(direction, normal) <= 0.0:
             break
         rho = albedo(scene, hit, scene.footprint)
-        if sampling.sample_1d(scene.sobol, i, dimension + 5, scramble) >= wp.max(rho):
+        if sobol.sample_1d(scene.sobol, i, dimension + 5, scramble) >= wp.max(rho):
             break
         throughput = wp.cw_mul(throughput, rho) / wp.max(rho)
         position = hit.position
@@ -134,7 +135,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
     whole.image_columns, whole.image_rows, whole.first_column, whole.first_row = whole.columns, whole.rows, 0, 0
     whole.shows_lights = 0
     paths = whole.columns * whole.rows
-    scramble = sampling.iteration_scramble(settings.seed, _CAMERA_PATHS)
+    scramble = sobol.iteration_scramble(settings.seed, _CAMERA_PATHS)
     gbuffer, *_ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
     trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
     n = paths * _VERTICES * _ASKED
@@ -200,7 +201,7 @@ def _connect(
     for k in range(_CONNECTION_COUNT):
         row = i * _CONNECTION_COUNT + k
         gives[row] = 0.0
-        point = int(sampling.hash_combine(wp.uint32(row), wp.uint32(0)) % paths) * _ROWS
+        point = int(sobol.hash_combine(wp.uint32(row), wp.uint32(0)) % paths) * _ROWS
         if seen.weight[point] > 0.0:
             way = position - seen.position[point]
             squared = wp.dot(way, way) + 1.0e-30
@@ -235,7 +236,7 @@ def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, setti
         paths=paths,
         absorption="roulette",
         max_bounces=settings.bounce_limit,
-        scramble=sampling.iteration_scramble(settings.seed, _LIGHT_PATHS),
+        scramble=sobol.iteration_scramble(settings.seed, _LIGHT_PATHS),
     )
     on_surfaces = int(vpls.count.numpy()[0]) - vpls.on_lights
     n = min(on_surfaces, _VPLS_PER_PATH * paths)

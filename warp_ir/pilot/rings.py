@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.launch import Launcher
 from warp_ir.lights import Aim
 from warp_ir.pilot.emitters import BY_POWER, PRIOR, WORTH
 from warp_ir.pilot.probes import Sightings, clipped

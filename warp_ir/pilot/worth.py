@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.guide import CELLS, LEAST_KEPT, SIDES, Guide, Worth
-from warp_ir.launch import Launcher
 from warp_ir.pilot.emitters import PRIOR
 from warp_ir.pilot.probes import Connections, clipped
 

@@ -11,16 +11,16 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.film_data import FilmData
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.film.accumulate import FilmData
 from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, project, see
-from warp_ir.launch import MOST_REGISTERS, Launcher
 from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
 from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
 from warp_ir.reconstruction.moments import Blur, at_middle
 from warp_ir.reconstruction.observations import Observations
 from warp_ir.reconstruction.surfaces import MATCH, same_surface
-from warp_ir.sampling import stratum_at
+from warp_ir.sampling.sobol import stratum_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

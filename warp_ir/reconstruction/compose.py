@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.film_data import FilmData, emission_of
-from warp_ir.launch import MOST_REGISTERS, Launcher
+from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.reconstruction.edges import Lit, Pixel, look_closely, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
 from warp_ir.reconstruction.observations import Observations

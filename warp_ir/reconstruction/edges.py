@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import CameraData, SceneData
-from warp_ir.film_data import FilmData, emission_of
+from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.gbuffer import Sight, camera_ray, jitter, see
 from warp_ir.reconstruction.filter import Layer, mean_channel, value
 from warp_ir.reconstruction.observations import Observations

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
 from warp_ir.reconstruction.surfaces import Surfaces, fits
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

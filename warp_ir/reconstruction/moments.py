@@ -11,9 +11,9 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import Anchor, GBuffer, project
-from warp_ir.launch import Launcher
 from warp_ir.reconstruction.observations import Observations, add_other, add_sample
 from warp_ir.reconstruction.surfaces import MATCH, pixel_around, same_surface
 from warp_ir.surface import Hit, scene_at, shading_normal

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.launch import Launcher, carve, floats
+from warp_ir.device.launcher import Launcher, carve, floats
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
 from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_picture
 from warp_ir.reconstruction.filter import filter_layer, new_layer

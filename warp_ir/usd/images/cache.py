@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.mipmap import resized
+from warp_ir.image.mipmap import resized
 from warp_ir.scene import Floats, Texture
 from warp_ir.usd.images.asset import MAX_PIXELS, Image, read_texture
 from warp_ir.usd.images.shading_value import Signal, compact

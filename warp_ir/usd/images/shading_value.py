@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_ir.mipmap import resized
+from warp_ir.image.mipmap import resized
 from warp_ir.scene import Floats, Wrap
 
 

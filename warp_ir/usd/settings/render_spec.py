@@ -8,7 +8,7 @@ from typing import Any
 
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender
 
-from warp_ir.color_space import COLOR_SPACES
+from warp_ir.image.color_space import COLOR_SPACES
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.usd.shading.binding import PURPOSES

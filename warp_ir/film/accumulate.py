@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_ir.device.launcher import Launcher
 from warp_ir.gbuffer import GBuffer
-from warp_ir.launch import Launcher
 from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

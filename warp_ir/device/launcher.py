@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.profiling import Profile
+from warp_ir.device.profiling import Profile
 from warp_ir.scene import InputError
 
 _MOST_OF_A_LAUNCH = 16

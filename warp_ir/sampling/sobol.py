@@ -1,4 +1,4 @@
-"""Low-discrepancy samples as a pure function of (index, dimension, scramble), and warps of the unit square.
+"""Low-discrepancy samples as a pure function of (index, dimension, scramble).
 
 Sobol' points (direction numbers of Joe and Kuo 2008, in their order) with Owen's nested uniform scrambling,
 done by a hash of the bit-reversed digits (Laine and Karras 2011; Burley 2020; constants of Vegdahl 2021).
@@ -174,46 +174,3 @@ def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scrambl
 def sample_2d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> wp.vec2:
     """Coordinates `dimension` and `dimension` + 1 of a point, in [0, 1)²."""
     return wp.vec2(sample_1d(matrices, index, dimension, scramble), sample_1d(matrices, index, dimension + 1, scramble))
-
-
-@wp.func
-def to_frame(v: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """`v` in an orthonormal frame with z along the unit vector `n` (Duff et al. 2017)."""
-    s = wp.where(n[2] >= 0.0, 1.0, -1.0)
-    a = -1.0 / (s + n[2])
-    b = n[0] * n[1] * a
-    x = wp.vec3(1.0 + s * n[0] * n[0] * a, s * b, -s * n[0])
-    y = wp.vec3(b, s + n[1] * n[1] * a, -n[1])
-    return v[0] * x + v[1] * y + v[2] * n
-
-
-@wp.func
-def to_disk(u: wp.vec2) -> wp.vec2:
-    """Uniform on the unit disk, by the concentric map (Shirley and Chiu 1997)."""
-    a = 2.0 * u[0] - 1.0
-    b = 2.0 * u[1] - 1.0
-    r = a
-    phi = float(0.0)
-    if wp.abs(a) > wp.abs(b):
-        phi = 0.25 * wp.pi * (b / a)
-    elif b != 0.0:
-        r = b
-        phi = 0.5 * wp.pi - 0.25 * wp.pi * (a / b)
-    return wp.vec2(r * wp.cos(phi), r * wp.sin(phi))
-
-
-@wp.func
-def to_cosine_hemisphere(u: wp.vec2, n: wp.vec3) -> wp.vec3:
-    """A unit direction around `n` with density cosθ/π per solid angle."""
-    d = to_disk(u)
-    z = wp.sqrt(wp.max(0.0, 1.0 - wp.dot(d, d)))
-    return wp.normalize(to_frame(wp.vec3(d[0], d[1], z), n))
-
-
-@wp.func
-def to_cone(u: wp.vec2, one_minus_cos: float, n: wp.vec3) -> wp.vec3:
-    """A unit direction uniform per solid angle in the cone around `n` given by 1 - cosθ_max (2: the sphere)."""
-    h = u[0] * one_minus_cos
-    r = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
-    phi = 2.0 * wp.pi * u[1]
-    return wp.normalize(to_frame(wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h), n))

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.film_data import FilmData, emission_of
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
+from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.tiles import TILE, Tiles, pixel_of_tile, tile_count
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -71,7 +71,7 @@ def _likely(mean: wp.float64, variance: wp.float64, around: wp.float64) -> wp.fl
     return mean + (around - mean) / (wp.float64(1.0) + wp.float64(_TRUST) * ratio * ratio)
 
 
-@wp.kernel(module="warp_ir.film_data")
+@wp.kernel(module="warp_ir.film.accumulate")
 def _measure(
     first: int,
     film: FilmData,

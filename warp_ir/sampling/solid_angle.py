@@ -11,7 +11,7 @@ decides how bright anything is, however small, large, near or far the light.
 
 import warp as wp
 
-from warp_ir import sampling
+from warp_ir.sampling.square_to import from_local, square_to_disk
 from warp_ir.scene import LightKind
 
 wp.set_module_options({"enable_backward": False})
@@ -128,7 +128,7 @@ def _aim_at_sphere(centre: wp.vec3, u: wp.vec2) -> Aim:
     r = wp.sqrt(sine_squared)
     phi = 2.0 * wp.pi * u[1]
     around = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h)
-    out.way = t * sampling.to_frame(around, centre / distance)
+    out.way = t * from_local(around, centre / distance)
     out.density = 1.0 / (2.0 * wp.pi * whole)
     return out
 
@@ -194,7 +194,7 @@ def _aim_at_flat(kind: int, space: _Space, u: wp.vec2) -> Aim:
         return out
     p = wp.vec2(wp.lerp(low[0], high[0], u[0]), wp.lerp(low[1], high[1], u[1]))
     if kind == _DISK:
-        p = centre + sampling.to_disk(u)
+        p = centre + square_to_disk(u)
     out.way = wp.vec3(p[0], p[1], -z)
     out.density = _per_area(out.way, _area(kind, half))
     return out

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.color_space import COLOR_SPACES, REC709, from_rec709
+from warp_ir.image.color_space import COLOR_SPACES, REC709, from_rec709
+from warp_ir.image.tonemap import srgb_from_linear, tone_map
 from warp_ir.scene import InputError
-from warp_ir.tonemap import srgb_from_linear, tone_map
 
 Array = npt.NDArray[np.floating]
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.denoise import denoise
-from warp_ir.film_data import FilmData, add_samples
-from warp_ir.film_error import measure
-from warp_ir.launch import Launcher
+from warp_ir.device.launcher import Launcher
+from warp_ir.film.accumulate import FilmData, add_samples
+from warp_ir.film.denoise import denoise
+from warp_ir.film.error_estimate import measure
 from warp_ir.scene import InputError
 from warp_ir.tiles import TILE, all_tiles, some_tiles, tile_count
 
