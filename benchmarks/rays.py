@@ -25,9 +25,9 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
 from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
-from warp_ir.guide import unguided
 from warp_ir.surface import closest, visible
-from warp_ir.vpl import VplBuffer, emit_vpls
+from warp_ir.vpl.emission import VplBuffer, emit_vpls
+from warp_ir.vpl.guide import unguided
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,10 +13,10 @@ from methods import load_task, stored_tasks
 
 import warp_ir as ir
 import warp_ir.estimators.vpl
-from warp_ir.guide import unguided
 from warp_ir.procedural import cube, mesh, quad
 from warp_ir.renderer import Renderer
 from warp_ir.scene import Camera, Light, LightKind, Material, Mesh, Scene
+from warp_ir.vpl.guide import unguided
 
 _WHITE, _RED, _LAMP, _GROUND = range(4)
 _MATERIALS = (

@@ -12,9 +12,9 @@ import warp_ir as ir
 from tests.physics.closed_form import placed
 from tests.physics.test_light_control import DOWN, everything, lamp_profile
 from warp_ir.cli import main
-from warp_ir.cost import pixel_bytes, scene_bytes
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_moments
+from warp_ir.memory import pixel_bytes, scene_bytes
 from warp_ir.procedural import cornell_box, furnace, mesh, sphere
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind, Shaping

@@ -14,7 +14,7 @@ import warp as wp
 
 import warp_ir as ir
 import warp_ir.estimators.vpl
-import warp_ir.vpl
+import warp_ir.vpl.emission
 from tests.physics.test_invariance import room
 from warp_ir.device.launcher import MOST_REGISTERS
 from warp_ir.device_scene import SceneData
@@ -124,7 +124,7 @@ def resources(cubin):
 def test_chosen_vpls_have_room():
     """A thread without lanes keeps the VPLs it has chosen in an array of eight."""
     how = warp_ir.estimators.vpl
-    assert max(*how._SHADOW_RAYS, *how._SHADOW_RAYS_AFTER) <= warp_ir.gather._MOST_RAYS
+    assert max(*how._SHADOW_RAYS, *how._SHADOW_RAYS_AFTER) <= warp_ir.vpl.gather._MOST_RAYS
 
 
 READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")
@@ -150,7 +150,7 @@ def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
     """
     settings = ir.RenderSettings(**{"width": 24, "height": 24, "light_paths": 64, "iterations": 3, **settings})
     if room is not None:
-        monkeypatch.setattr(warp_ir.vpl, "_MOST_ROOM", room)
+        monkeypatch.setattr(warp_ir.vpl.emission, "_MOST_ROOM", room)
     expected = ir.render(scene, settings)
     renderer = Renderer(scene, settings)
     renderer.launcher.waits = False

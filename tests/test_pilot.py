@@ -10,15 +10,15 @@ import warp_ir as ir
 import warp_ir.estimators.vpl
 from tests.physics.closed_form import assert_mean
 from warp_ir import procedural
-from warp_ir.guide import CELLS, SIDES, unguided
+from warp_ir.guiding.emitter_selection import BY_POWER, probabilities
+from warp_ir.guiding.importance import means
+from warp_ir.guiding.photon_target import nearest_point
+from warp_ir.guiding.probes import look
 from warp_ir.metrics import z_scores
-from warp_ir.pilot.emitters import BY_POWER, probabilities
-from warp_ir.pilot.probes import look
-from warp_ir.pilot.rings import nearest_point
-from warp_ir.pilot.worth import means
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind
+from warp_ir.vpl.guide import CELLS, SIDES, unguided
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
@@ -111,7 +111,7 @@ def test_nothing_changes_where_little_is_gained(monkeypatch, device):
     how = {"iterations": 2, "width": 64, "height": 64}
     alone = film_of(cornell_box(), device=device, **how)
     assert not any(name in alone.counts for name in GUIDED)
-    monkeypatch.setattr("warp_ir.pilot._APART", 0.0)
+    monkeypatch.setattr("warp_ir.guiding.learn._APART", 0.0)
     guided = film_of(cornell_box(), device=device, **how)
     assert [guided.counts[name] for name in GUIDED] == [0, 0, 0]
     assert np.array_equal(guided.radiance(), alone.radiance())

@@ -8,7 +8,7 @@ import pytest
 import warp_ir as ir
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
-from warp_ir.stopping import Stopping, worthwhile
+from warp_ir.scheduling import Stopping, worthwhile
 
 SETTINGS = ir.RenderSettings(width=36, height=20, light_paths=64)  # 5 x 3 tiles, some of which reach beyond
 

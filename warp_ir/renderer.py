@@ -27,27 +27,27 @@ import warp_ir.estimators.keller
 import warp_ir.estimators.path
 import warp_ir.estimators.vpl
 import warp_ir.film.accumulate
-import warp_ir.gather
 import warp_ir.gbuffer
 import warp_ir.reconstruction.blur
 import warp_ir.reconstruction.compose
 import warp_ir.reconstruction.filter
-import warp_ir.reconstruction.observations
-import warp_ir.vpl
-from warp_ir.cost import pixel_bytes
+import warp_ir.reconstruction.sample_buffer
+import warp_ir.vpl.emission
+import warp_ir.vpl.sets
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film.denoise import denoise_seconds
 from warp_ir.film.film import Film
 from warp_ir.gbuffer import new_gbuffer
-from warp_ir.guide import unguided
+from warp_ir.memory import pixel_bytes
 from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling.sobol import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
+from warp_ir.scheduling import Progress, Stopping
 from warp_ir.settings import RenderSettings
-from warp_ir.stopping import Progress, Stopping
-from warp_ir.vpl import Vpls, emit_vpls, to_host
+from warp_ir.vpl.emission import Vpls, emit_vpls, to_host
+from warp_ir.vpl.guide import unguided
 
 
 class Renderer:
@@ -287,15 +287,15 @@ def trace_vpls(
 def _modules(estimator: str) -> tuple[list[Any], list[Any]]:
     """What has kernels that an estimator needs for any scene: what takes long to compile, and the rest."""
     if estimator == "vpl":
-        reconstruction = warp_ir.reconstruction.observations, warp_ir.reconstruction.filter
-        return [warp_ir.gbuffer, warp_ir.vpl], [
+        reconstruction = warp_ir.reconstruction.sample_buffer, warp_ir.reconstruction.filter
+        return [warp_ir.gbuffer, warp_ir.vpl.emission], [
             *reconstruction,
-            warp_ir.gather,
+            warp_ir.vpl.sets,
             warp_ir.film.accumulate,
             warp_ir.reconstruction.compose,
         ]
     if estimator == "keller":
-        return [warp_ir.gbuffer, warp_ir.vpl, warp_ir.estimators.keller], [warp_ir.film.accumulate]
+        return [warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.estimators.keller], [warp_ir.film.accumulate]
     return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film.accumulate]
 
 

@@ -6,7 +6,7 @@ import pytest
 from tests.physics.closed_form import assert_mean, render
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import furnace
-from warp_ir.vpl import survivors
+from warp_ir.vpl.emission import survivors
 
 PATHS = 256
 

@@ -9,10 +9,10 @@ hierarchy of the prototype, in whose space they go on.
 """
 
 from warp_ir.bvh.build import build_instance_tree
-from warp_ir.bvh.lanes import on_cuda
-from warp_ir.bvh.layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.intersect8 import on_cuda
+from warp_ir.bvh.node_layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.traverse import intersect, intersect_instances
 from warp_ir.bvh.trees import Trees
-from warp_ir.bvh.walk import intersect, intersect_instances
 
 __all__ = [
     "Bvh",

@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.bvh.layout import INFINITY, LANES, Bvh, Instance, InstanceTree, vec8, vec8i
-from warp_ir.bvh.warp_tree import box_corner, is_leaf, link, node_count, primitive, tree_of, tree_root
+from warp_ir.bvh.node_layout import INFINITY, LANES, Bvh, Instance, InstanceTree, vec8, vec8i
+from warp_ir.bvh.warp_bvh import box_corner, is_leaf, link, node_count, primitive, tree_of, tree_root
 from warp_ir.device.launcher import Launcher
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ir.bvh.layout import INFINITY, Bvh
-from warp_ir.bvh.warp_tree import box_corner
+from warp_ir.bvh.node_layout import INFINITY, Bvh
+from warp_ir.bvh.warp_bvh import box_corner
 from warp_ir.device.launcher import Launcher
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

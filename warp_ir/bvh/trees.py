@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from warp_ir.bvh.build import build_tree, concatenated, tree_address, tree_size
-from warp_ir.bvh.layout import Bvh, MeshTree, vec8, vec8i
+from warp_ir.bvh.node_layout import Bvh, MeshTree, vec8, vec8i
 from warp_ir.bvh.refit import box_of, refit_tree, warp_cost, wide_cost
-from warp_ir.bvh.top import build_top
+from warp_ir.bvh.top_level import build_top
 from warp_ir.device.launcher import Launcher, copied
 
 wp.set_module_options({"enable_backward": False})

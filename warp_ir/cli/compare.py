@@ -19,8 +19,8 @@ from typing import Any
 import warp_ir as ir
 from warp_ir.cli.arguments import METHODS, settings_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
-from warp_ir.cli.device import open_device
-from warp_ir.cli.stage import moment_of, open_reader
+from warp_ir.cli.device_choice import open_device
+from warp_ir.cli.stage_options import moment_of, open_reader
 from warp_ir.film.denoise import require_denoiser
 from warp_ir.image.io import check_output, whole_file
 from warp_ir.metrics import mean_ratio, relative_mse

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from warp_ir.cli.importing import importing
+from warp_ir.cli.import_guard import importing
 from warp_ir.scene import InputError
 
 Moment = float | str | None

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from warp_ir.cli.console import say_warnings
-from warp_ir.cli.stage import moment_of, open_reader, stage_facts
-from warp_ir.cost import scene_bytes
+from warp_ir.cli.stage_options import moment_of, open_reader, stage_facts
+from warp_ir.memory import scene_bytes
 from warp_ir.scene import Light, LightKind, Material, Mesh, MeshLight, Scene
 
 _SKIPPED = (

@@ -17,10 +17,10 @@ import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, fingerprint, path_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
-from warp_ir.cli.device import open_device
+from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import Moment, outputs_of, time_codes
-from warp_ir.cli.importing import importing
-from warp_ir.cli.stage import moment_of, open_reader
+from warp_ir.cli.import_guard import importing
+from warp_ir.cli.stage_options import moment_of, open_reader
 from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
 from warp_ir.image.tonemap import suggest_exposure
 from warp_ir.scene import InputError

@@ -10,8 +10,8 @@ import numpy as np
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.console import muted_stderr, say, say_warnings
-from warp_ir.cli.device import open_device
-from warp_ir.cli.stage import moment_of, open_reader, stage_facts
+from warp_ir.cli.device_choice import open_device
+from warp_ir.cli.stage_options import moment_of, open_reader, stage_facts
 from warp_ir.image.io import check_output, whole_file
 from warp_ir.scene import InputError, Scene
 

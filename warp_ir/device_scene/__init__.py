@@ -3,9 +3,9 @@
 `upload.py` is the whole on one page; `records.py` says what is there.
 """
 
-from warp_ir.device_scene.camera import CameraData, camera_data
+from warp_ir.device_scene.camera_data import CameraData, camera_data
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.records import INSTANCE_COLOR, TRIANGLE_EMITTER, Patterns, SceneData
+from warp_ir.device_scene.scene_data import INSTANCE_COLOR, TRIANGLE_EMITTER, Patterns, SceneData
 from warp_ir.device_scene.upload import DeviceScene, upload_moments, upload_scene
 
 __all__ = [

@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_ir.device.launcher import Launcher, copied
-from warp_ir.device_scene.check import check_scene
-from warp_ir.device_scene.emitters import upload_emitters
+from warp_ir.device_scene.emitter_table import upload_emitters
 from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
-from warp_ir.device_scene.lights import upload_lights
-from warp_ir.device_scene.records import SceneData
-from warp_ir.device_scene.storage import arranged
-from warp_ir.device_scene.surfaces import Surfaces, same_objects
+from warp_ir.device_scene.geometry_storage import arranged
+from warp_ir.device_scene.geometry_update import Surfaces, same_objects
+from warp_ir.device_scene.light_tables import upload_lights
+from warp_ir.device_scene.scene_data import SceneData
+from warp_ir.device_scene.validate import check_scene
 from warp_ir.sampling import sobol
 from warp_ir.sampling.distribution2d import GridList
 from warp_ir.scene import InputError, Scene, materials_of

@@ -23,12 +23,12 @@ import warp as wp
 from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.guide import unguided
 from warp_ir.lights import arriving
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import indices, pixel_at
-from warp_ir.vpl import VplBuffer, emit_vpls
+from warp_ir.vpl.emission import VplBuffer, emit_vpls
+from warp_ir.vpl.guide import unguided
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -16,20 +16,21 @@ from typing import Any
 
 import warp as wp
 
-import warp_ir.pilot.probes
+import warp_ir.guiding.probes
 from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.gather import ON_LIGHTS, ON_SURFACES, Receiver, VplSets, arrange, gather
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.guide import Guide, unguided
+from warp_ir.guiding import can_pay, learn
 from warp_ir.lights import cut_share, lights_beyond, surface_beyond
-from warp_ir.pilot import can_pay, learn
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
-from warp_ir.vpl import emit_vpls
+from warp_ir.vpl.emission import emit_vpls
+from warp_ir.vpl.gather import Receiver, gather
+from warp_ir.vpl.guide import Guide, unguided
+from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, arrange
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -83,7 +84,9 @@ def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
     return x
 
 
-@wp.kernel(module="warp_ir.vpl", cuda_max_registers=MOST_REGISTERS)  # so that rays and lights are compiled once
+@wp.kernel(
+    module="warp_ir.vpl.emission", cuda_max_registers=MOST_REGISTERS
+)  # so that rays and lights are compiled once
 def _gather_pixels(
     first: int,
     scene: SceneData,
@@ -169,7 +172,7 @@ class VplGatherer:
         if can_pay(scene):
             self._guide = None  # to be learned
             if settings.iteration_limit > _UNGUIDED:
-                launcher.load([warp_ir.pilot.probes])
+                launcher.load([warp_ir.guiding.probes])
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
         """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""

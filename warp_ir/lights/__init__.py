@@ -3,12 +3,12 @@
 `shape.py` is one light, `arriving.py` what of it gets to a point.
 """
 
-from warp_ir.lights.arriving import arriving
-from warp_ir.lights.beyond import Bound, bound_on, cut_share, lights_beyond, surface_beyond
-from warp_ir.lights.found import lights_found, surface_found, surface_seen
-from warp_ir.lights.next_event import Arrival, power_heuristic, sample_arrival
-from warp_ir.lights.photons import Aim, emit, land
-from warp_ir.lights.points import LightPoint, choose_emitter, sample_light
+from warp_ir.lights.bias_compensation import Bound, bound_on, cut_share, lights_beyond, surface_beyond
+from warp_ir.lights.emit_photon import Aim, emit, land
+from warp_ir.lights.intersect import lights_found, surface_found, surface_seen
+from warp_ir.lights.sample_area import LightPoint, choose_emitter, sample_light
+from warp_ir.lights.sample_direct import Arrival, power_heuristic, sample_arrival
+from warp_ir.lights.visibility import arriving
 
 __all__ = [
     "Aim",

@@ -13,7 +13,7 @@ noise. On edges a part of the difference is given back, as much of it as is not 
 (`compose.py`).
 """
 
-from warp_ir.reconstruction.moments import surfaces_move
 from warp_ir.reconstruction.reconstruct import SCRATCH, Reconstruction
+from warp_ir.reconstruction.reprojection import surfaces_move
 
 __all__ = ["SCRATCH", "Reconstruction", "surfaces_move"]

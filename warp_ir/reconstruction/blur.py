@@ -17,9 +17,9 @@ from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, pr
 from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
 from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
-from warp_ir.reconstruction.moments import Blur, at_middle
-from warp_ir.reconstruction.observations import Observations
-from warp_ir.reconstruction.surfaces import MATCH, same_surface
+from warp_ir.reconstruction.pixel_surfaces import MATCH, same_surface
+from warp_ir.reconstruction.reprojection import Blur, at_middle
+from warp_ir.reconstruction.sample_buffer import Observations
 from warp_ir.sampling.sobol import stratum_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

@@ -9,8 +9,8 @@ from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.reconstruction.edges import Lit, Pixel, look_closely, on_edge
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
-from warp_ir.reconstruction.observations import Observations
-from warp_ir.reconstruction.surfaces import Surfaces
+from warp_ir.reconstruction.pixel_surfaces import Surfaces
+from warp_ir.reconstruction.sample_buffer import Observations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

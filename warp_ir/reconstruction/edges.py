@@ -6,8 +6,8 @@ from warp_ir.device_scene import CameraData, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.gbuffer import Sight, camera_ray, jitter, see
 from warp_ir.reconstruction.filter import Layer, mean_channel, value
-from warp_ir.reconstruction.observations import Observations
-from warp_ir.reconstruction.surfaces import MATCH, Surfaces, pixel_around, same_surface
+from warp_ir.reconstruction.pixel_surfaces import MATCH, Surfaces, pixel_around, same_surface
+from warp_ir.reconstruction.sample_buffer import Observations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.reconstruction.surfaces import Surfaces, fits
+from warp_ir.reconstruction.pixel_surfaces import Surfaces, fits
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -12,8 +12,8 @@ from warp_ir.device.launcher import Launcher, carve, floats
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
 from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_picture
 from warp_ir.reconstruction.filter import filter_layer, new_layer
-from warp_ir.reconstruction.moments import Moment, guess_noise, new_blur, observe_blurred
-from warp_ir.reconstruction.observations import average, look, observe, sums
+from warp_ir.reconstruction.reprojection import Moment, guess_noise, new_blur, observe_blurred
+from warp_ir.reconstruction.sample_buffer import average, look, observe, sums
 
 _FILTER_PASSES = 6.0
 """Filtering takes as long as so many passes of camera rays: fewer where rays are dear."""

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.records import Patterns
+from warp_ir.device_scene.scene_data import Patterns
 from warp_ir.scene import Material, Texture
 
 LARGEST_UV = 1.0e6

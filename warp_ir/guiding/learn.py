@@ -20,13 +20,13 @@ import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.guide import Guide, unguided
-from warp_ir.pilot.emitters import choose_emitters
-from warp_ir.pilot.probes import connect, look
-from warp_ir.pilot.rings import aim_at_foci
-from warp_ir.pilot.worth import judge
+from warp_ir.guiding.emitter_selection import choose_emitters
+from warp_ir.guiding.importance import judge
+from warp_ir.guiding.photon_target import aim_at_foci
+from warp_ir.guiding.probes import connect, look
 from warp_ir.scene import LightKind
 from warp_ir.settings import RenderSettings
+from warp_ir.vpl.guide import Guide, unguided
 
 _APART = 0.25
 """Of the scene's diagonal: lights that are closer together than that are seen together, or not at all."""

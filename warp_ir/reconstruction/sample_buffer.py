@@ -8,7 +8,7 @@ from warp_ir.device.launcher import Launcher, copied
 from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
-from warp_ir.reconstruction.surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
+from warp_ir.reconstruction.pixel_surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
 from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.records import LightTables
-from warp_ir.light_control import upload_controls
+from warp_ir.device_scene.scene_data import LightTables
+from warp_ir.light_modifiers import upload_controls
 from warp_ir.sampling.distribution2d import GridList, cell_measure
 from warp_ir.scene import InputError, Light, LightKind, Scene
 

@@ -10,9 +10,9 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.materials import LARGEST_UV
-from warp_ir.device_scene.records import TRIANGLE_EMITTER
-from warp_ir.light_control import shaped_power
+from warp_ir.device_scene.material_tables import LARGEST_UV
+from warp_ir.device_scene.scene_data import TRIANGLE_EMITTER
+from warp_ir.light_modifiers import shaped_power
 from warp_ir.scene import Light, LightKind, Mesh, Scene
 from warp_ir.texture import mean_on_triangles
 

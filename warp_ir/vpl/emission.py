@@ -19,11 +19,11 @@ import warp as wp
 
 from warp_ir.device.launcher import MOST_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.guide import Guide, Worth, kept_probability
 from warp_ir.lights import Aim, emit, land, sample_light
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.surface import albedo, closest, scene_at
+from warp_ir.vpl.guide import Guide, Worth, kept_probability
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

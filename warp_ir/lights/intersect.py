@@ -3,8 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.lights.arriving import may_find, shaping_along
-from warp_ir.lights.next_event import choice_probability, found_weight, shape_density, surface_weight
+from warp_ir.lights.sample_direct import choice_probability, found_weight, shape_density, surface_weight
 from warp_ir.lights.shape import (
     control_of,
     control_of_surface,
@@ -14,6 +13,7 @@ from warp_ir.lights.shape import (
     light_axis,
     texture_of,
 )
+from warp_ir.lights.visibility import may_find, shaping_along
 from warp_ir.sampling.distribution2d import direction_density, value_along
 from warp_ir.scene import LightKind
 from warp_ir.surface import Hit, emission, glow, has_glow, scene_at

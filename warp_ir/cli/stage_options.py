@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from warp_ir.cli.importing import importing
+from warp_ir.cli.import_guard import importing
 
 
 def open_reader(args: argparse.Namespace) -> Any:

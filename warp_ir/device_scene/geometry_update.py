@@ -9,13 +9,13 @@ import warp as wp
 
 from warp_ir.bvh import Trees, TwoLevel
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.corners import corner_tables
+from warp_ir.device_scene.corner_attributes import corner_tables
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.instances import InstanceTables, upload_instances
-from warp_ir.device_scene.materials import LARGEST_UV, upload_materials
-from warp_ir.device_scene.records import INSTANCE_COLOR, Patterns
-from warp_ir.device_scene.storage import Layout, Part
-from warp_ir.device_scene.table import Table
+from warp_ir.device_scene.geometry_storage import Layout, Part
+from warp_ir.device_scene.growing_table import Table
+from warp_ir.device_scene.instance_tables import InstanceTables, upload_instances
+from warp_ir.device_scene.material_tables import LARGEST_UV, upload_materials
+from warp_ir.device_scene.scene_data import INSTANCE_COLOR, Patterns
 from warp_ir.scene import Scene, Texture
 from warp_ir.texture import upload_textures
 

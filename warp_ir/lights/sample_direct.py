@@ -3,9 +3,9 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.lights.arriving import only_sampled
-from warp_ir.lights.points import choose_emitter, sample_emitter
+from warp_ir.lights.sample_area import choose_emitter, sample_emitter
 from warp_ir.lights.shape import area_scale, control_of, lift, light_axis, texture_of, texture_place, unit_area
+from warp_ir.lights.visibility import only_sampled
 from warp_ir.sampling.distribution2d import place_density
 from warp_ir.sampling.solid_angle import aim_at, aim_density
 from warp_ir.scene import LightKind

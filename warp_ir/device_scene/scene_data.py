@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.bvh import Bvh, Instance, TwoLevel
-from warp_ir.light_control import ControlTables
+from warp_ir.light_modifiers import ControlTables
 from warp_ir.sampling.distribution2d import GridTables
 from warp_ir.scene import LightKind
 from warp_ir.texture import TextureTable

@@ -8,9 +8,9 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
+from warp_ir.guiding.emitter_selection import BY_POWER, PRIOR, WORTH
+from warp_ir.guiding.probes import Sightings, clipped
 from warp_ir.lights import Aim
-from warp_ir.pilot.emitters import BY_POWER, PRIOR, WORTH
-from warp_ir.pilot.probes import Sightings, clipped
 from warp_ir.scene import LightKind
 
 Floats = npt.NDArray[np.float64]

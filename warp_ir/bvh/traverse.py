@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.bvh.lanes import below, enter, first_lane, meet, meet_loosely, on_cuda, reciprocal
-from warp_ir.bvh.layout import Bvh, InstanceTree, RayHit, TwoLevel, vec8, vec8i
+from warp_ir.bvh.intersect8 import below, enter, first_lane, meet, meet_loosely, on_cuda, reciprocal
+from warp_ir.bvh.node_layout import Bvh, InstanceTree, RayHit, TwoLevel, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
 

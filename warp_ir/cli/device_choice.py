@@ -1,7 +1,7 @@
 """Which device a command runs on."""
 
 from warp_ir.cli.console import muted_stderr
-from warp_ir.cli.importing import importing
+from warp_ir.cli.import_guard import importing
 from warp_ir.scene import InputError
 
 

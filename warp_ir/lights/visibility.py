@@ -6,7 +6,7 @@ Where a light has a `LightControl`, `arriving` takes the place of `visible`.
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.light_control import linked, shaping_factor
+from warp_ir.light_modifiers import linked, shaping_factor
 from warp_ir.surface import Hit, closest, leave, scene_at, visible
 
 wp.set_module_options({"enable_backward": False})

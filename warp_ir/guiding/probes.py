@@ -11,13 +11,13 @@ import warp as wp
 from warp_ir.device.launcher import MOST_REGISTERS, Launcher, copied
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
-from warp_ir.guide import CELLS, Guide, cell_of
 from warp_ir.lights import arriving, choose_emitter, sample_arrival
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest, visible
-from warp_ir.vpl import VplBuffer, emit_vpls
+from warp_ir.vpl.emission import VplBuffer, emit_vpls
+from warp_ir.vpl.guide import CELLS, Guide, cell_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

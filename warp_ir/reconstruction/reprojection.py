@@ -14,8 +14,8 @@ import warp as wp
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import Anchor, GBuffer, project
-from warp_ir.reconstruction.observations import Observations, add_other, add_sample
-from warp_ir.reconstruction.surfaces import MATCH, pixel_around, same_surface
+from warp_ir.reconstruction.pixel_surfaces import MATCH, pixel_around, same_surface
+from warp_ir.reconstruction.sample_buffer import Observations, add_other, add_sample
 from warp_ir.surface import Hit, scene_at, shading_normal
 from warp_ir.tiles import indices, pixel_at
 

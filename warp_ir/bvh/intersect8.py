@@ -6,7 +6,7 @@ evaluated so that two triangles get the same value for a common edge: no ray sli
 
 import warp as wp
 
-from warp_ir.bvh.layout import vec8
+from warp_ir.bvh.node_layout import vec8
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,9 +3,9 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.light_control import linked, shaping_factor
-from warp_ir.lights.arriving import CROSSINGS, behind
-from warp_ir.lights.points import LightPoint
+from warp_ir.light_modifiers import linked, shaping_factor
+from warp_ir.lights.sample_area import LightPoint
+from warp_ir.lights.visibility import CROSSINGS, behind
 from warp_ir.sampling.distribution2d import cell_direction, sample_cell
 from warp_ir.sampling.square_to import from_local, square_to_cone, square_to_cosine_hemisphere, square_to_disk
 from warp_ir.surface import Hit, closest, scene_at

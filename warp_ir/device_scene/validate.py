@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.storage import glowing_meshes
+from warp_ir.device_scene.geometry_storage import glowing_meshes
 from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000

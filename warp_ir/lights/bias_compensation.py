@@ -3,9 +3,9 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.lights.arriving import CROSSINGS, arriving, behind, may_find, only_sampled, shaping_along
-from warp_ir.lights.found import emission_towards
+from warp_ir.lights.intersect import emission_towards
 from warp_ir.lights.shape import control_of, control_of_surface, face_radiance, hit_shape
+from warp_ir.lights.visibility import CROSSINGS, arriving, behind, may_find, only_sampled, shaping_along
 from warp_ir.surface import Hit, closest, emission, scene_at
 
 wp.set_module_options({"enable_backward": False})

@@ -8,9 +8,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.guide import CELLS, LEAST_KEPT, SIDES, Guide, Worth
-from warp_ir.pilot.emitters import PRIOR
-from warp_ir.pilot.probes import Connections, clipped
+from warp_ir.guiding.emitter_selection import PRIOR
+from warp_ir.guiding.probes import Connections, clipped
+from warp_ir.vpl.guide import CELLS, LEAST_KEPT, SIDES, Guide, Worth
 
 Floats = npt.NDArray[np.float64]
 

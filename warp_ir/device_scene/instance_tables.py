@@ -11,7 +11,7 @@ import warp as wp
 from warp_ir.bvh import Instance, InstanceTree, build_instance_tree
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.storage import Moment
+from warp_ir.device_scene.geometry_storage import Moment
 from warp_ir.placing import boxes, cofactors
 from warp_ir.scene import InputError, Instances
 

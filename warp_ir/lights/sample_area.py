@@ -8,7 +8,6 @@ surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gat
 import warp as wp
 
 from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
-from warp_ir.lights.arriving import only_sampled
 from warp_ir.lights.shape import (
     area_scale,
     control_of,
@@ -19,6 +18,7 @@ from warp_ir.lights.shape import (
     unit_area,
     world_from_dome,
 )
+from warp_ir.lights.visibility import only_sampled
 from warp_ir.sampling.distribution2d import cell_direction, cell_place, sample_cell, value_along, value_at_place
 from warp_ir.sampling.square_to import square_to_cone, square_to_disk
 from warp_ir.scene import LightKind

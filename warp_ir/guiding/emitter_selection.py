@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher, copied
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.pilot.probes import Sightings
+from warp_ir.guiding.probes import Sightings
 
 Floats = npt.NDArray[np.float64]
 

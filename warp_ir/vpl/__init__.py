@@ -1,0 +1,1 @@
+"""Virtual point lights: emission along light paths, arrangement into sets, and gathering at a point."""
