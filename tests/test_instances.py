@@ -9,11 +9,11 @@ import warp as wp
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, render
 from warp_ir.device_scene import SceneData, upload_scene
-from warp_ir.placing import areas_of_copies, bounds_of_copies, place
 from warp_ir.procedural import cube, mesh, quad, sphere
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.scene import Instances, Texture
+from warp_ir.scene.instances import areas_of_copies, bounds_of_copies, place
 from warp_ir.surface import albedo, closest, visible
 
 wp.set_module_options({"enable_backward": False})

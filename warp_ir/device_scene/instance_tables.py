@@ -12,8 +12,8 @@ from warp_ir.bvh import Instance, InstanceTree, build_instance_tree
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.geometry_storage import Moment
-from warp_ir.placing import boxes, cofactors
 from warp_ir.scene import InputError, Instances
+from warp_ir.scene.instances import boxes, cofactors
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdLux
 
-from warp_ir.placing import areas_of_copies
 from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
+from warp_ir.scene.instances import areas_of_copies
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import Level, combined, combined_colors
 from warp_ir.usd.geometry.mesh import read_mesh, read_tet_mesh

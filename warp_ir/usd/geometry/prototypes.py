@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.placing import cofactors
 from warp_ir.scene import Floats, InputError
+from warp_ir.scene.instances import cofactors
 from warp_ir.usd.geometry.instancing import Level, combined, combined_colors
 from warp_ir.usd.values.triangles import Mask
 

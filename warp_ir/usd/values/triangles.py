@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir import placing
-from warp_ir.scene import Floats, Ints
+from warp_ir.scene import Floats, Ints, instances
 
 Mask = npt.NDArray[np.bool_]
 
@@ -96,8 +95,8 @@ def shaded(shape: Shape, normals: Floats) -> Shape:
 
 
 def place(shape: Shape, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
-    """Copies of a shape's points, triangles and normals: see `placing.place`."""
-    return placing.place(shape.points, shape.triangles, shape.normals, matrices)
+    """Copies of a shape's points, triangles and normals: see `scene.instances.place`."""
+    return instances.place(shape.points, shape.triangles, shape.normals, matrices)
 
 
 def _squared(vectors: Floats) -> Floats:

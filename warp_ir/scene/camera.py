@@ -1,0 +1,115 @@
+"""The camera: its window, its lens, and how it is fitted to an image of another aspect."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+
+from warp_ir.scene.types import Floats, InputError
+
+CONFORM_POLICIES = (
+    "expandAperture",
+    "cropAperture",
+    "adjustApertureWidth",
+    "adjustApertureHeight",
+    "adjustPixelAspectRatio",
+)
+"""How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
+
+
+MAX_CLIPPING_PLANES = 6
+"""Of a `Camera`: as many as a box has sides."""
+
+
+class Projection(IntEnum):
+    """How a `Camera` maps points to its film."""
+
+    PERSPECTIVE = 0
+    ORTHOGRAPHIC = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A perspective or orthographic camera that looks along its -Z, with +Y up."""
+
+    name: str = ""
+    world_from_camera: Floats = field(default_factory=lambda: np.eye(4))
+    """float64 [4, 4], rotation and translation only."""
+    window: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
+    """left, right, bottom, top of the film: on the plane z = -1 (perspective) or in scene units."""
+    projection: Projection = Projection.PERSPECTIVE
+    clipping: tuple[float, float] = (0.0, math.inf)
+    """Nearest and farthest depth along -Z that camera rays see, in scene units."""
+    exposure: float = 1.0
+    """Linear factor on the film's radiance (UsdGeomCamera's exposure controls; 1 by default)."""
+    lens_radius: float = 0.0
+    """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
+    focus_distance: float = 1.0
+    """Depth along -Z at which a camera with a lens is sharp, in scene units."""
+    clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
+    """At most `MAX_CLIPPING_PLANES` of (a, b, c, d): camera rays see only where a x + b y + c z + d >= 0, x, y, z being
+    the place in the camera's space."""
+
+    @property
+    def aspect(self) -> float:
+        """Width of the window over its height."""
+        left, right, bottom, top = self.window
+        return (right - left) / (top - bottom)
+
+    def fit(self, width: int, height: int, policy: str = CONFORM_POLICIES[0], pixel_aspect: float = 1.0) -> "Camera":
+        """This camera with its window made to fit an image, about its middle.
+
+        Args:
+            width: Of the image, in pixels.
+            height: Of the image.
+            policy: One of `CONFORM_POLICIES`: the window grows (expandAperture), shrinks (cropAperture), changes in
+                one of its sides alone (adjustApertureWidth, adjustApertureHeight), or stays as it is and the pixels
+                are stretched over it (adjustPixelAspectRatio).
+            pixel_aspect: Width of a pixel over its height.
+        """
+        left, right, bottom, top = self.window
+        grow = width / height * pixel_aspect / self.aspect  # 1: it fits already
+        wider, taller = {
+            "expandAperture": (max(grow, 1.0), max(1.0 / grow, 1.0)),
+            "cropAperture": (min(grow, 1.0), min(1.0 / grow, 1.0)),
+            "adjustApertureWidth": (grow, 1.0),
+            "adjustApertureHeight": (1.0, 1.0 / grow),
+            "adjustPixelAspectRatio": (1.0, 1.0),
+        }[policy]
+        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * wider
+        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * taller
+        return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
+
+    @staticmethod
+    def look_at(
+        eye: Sequence[float],
+        target: Sequence[float],
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        *,
+        fov: float = 45.0,
+        aspect: float = 1.0,
+        name: str = "",
+    ) -> "Camera":
+        """A perspective camera at `eye` that looks at `target`.
+
+        Args:
+            eye: Position, scene units.
+            target: The point in the middle of the picture.
+            up: Any direction that is upright in the picture; not parallel to the view.
+            fov: Vertical field of view [degrees].
+            aspect: Width over height of the window.
+            name: A label for messages.
+        """
+        origin = np.asarray(eye, dtype=np.float64)
+        back = origin - np.asarray(target, dtype=np.float64)
+        right = np.cross(np.asarray(up, dtype=np.float64), back)
+        if not (np.linalg.norm(back) > 0.0 and np.linalg.norm(right) > 0.0):
+            raise InputError("camera: eye and target coincide, or up is parallel to the view")
+        back /= np.linalg.norm(back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = right, np.cross(back, right), back, origin
+        y = math.tan(math.radians(fov) / 2.0)
+        return Camera(name=name, world_from_camera=matrix, window=(-y * aspect, y * aspect, -y, y))
