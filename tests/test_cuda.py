@@ -16,7 +16,7 @@ import warp_ir as ir
 import warp_ir.estimators.vpl
 import warp_ir.vpl.emission
 from tests.physics.test_invariance import room
-from warp_ir.device.launcher import MOST_REGISTERS
+from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import SceneData
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
@@ -73,7 +73,7 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
     traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
     for name, (registers, local) in used.items():
         if traces_rays and local > _MOST_LOCAL:
-            assert registers <= MOST_REGISTERS, f"{name}: {registers} registers"
+            assert registers <= MAX_REGISTERS, f"{name}: {registers} registers"
             # A copy of the scene's record, or the stack of the CPU's traversal, does not fit.
             assert local <= _MOST_LOCAL_OF_RAYS < ctypes.sizeof(SceneData.ctype), f"{name}: {local} bytes"
         else:

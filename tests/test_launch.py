@@ -99,9 +99,9 @@ def test_errors_of_a_launch_are_raised():
 def test_kept_arrays_stay():
     """A name gives the same array until it needs more rows, and other names give others."""
     launcher = Launcher("cpu", 1)
-    first = launcher.kept("a", 10, wp.int32)
-    assert launcher.kept("a", 5, wp.int32) is first and launcher.kept("b", 10, wp.int32) is not first
-    assert launcher.kept("a", 100, wp.int32).shape[0] >= 100
+    first = launcher.scratch("a", 10, wp.int32)
+    assert launcher.scratch("a", 5, wp.int32) is first and launcher.scratch("b", 10, wp.int32) is not first
+    assert launcher.scratch("a", 100, wp.int32).shape[0] >= 100
 
 
 def test_unknown_device_is_named():

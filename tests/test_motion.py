@@ -217,14 +217,14 @@ def test_the_sky_stays_where_a_lamp_or_a_mesh_moves(device):
         return replace(scene, lights=(replace(sky, texture=texture), lamp))
 
     renderer = ir.Renderer(with_lamp(100.0), settings, device=device)
-    there = renderer.scene.grids.upload(renderer.launcher)
+    there = renderer.scene.distributions.upload(renderer.launcher)
     moved = with_lamp(200.0)
     renderer.update(moved)
-    assert renderer.scene.grids.upload(renderer.launcher) is there
+    assert renderer.scene.distributions.upload(renderer.launcher) is there
     fresh = ir.Renderer(moved, settings, device=device)
     np.testing.assert_array_equal(renderer.render().radiance(), fresh.render().radiance())
     renderer.update(with_lamp(200.0, np.ones((8, 16, 3), np.float32)))
-    assert renderer.scene.grids.upload(renderer.launcher) is not there
+    assert renderer.scene.distributions.upload(renderer.launcher) is not there
 
 
 def test_stats_say_what_was_kept(tmp_path):

@@ -13,7 +13,7 @@ from warp_ir import procedural
 from warp_ir.guiding.emitter_selection import BY_POWER, probabilities
 from warp_ir.guiding.importance import means
 from warp_ir.guiding.photon_target import nearest_point
-from warp_ir.guiding.probes import look
+from warp_ir.guiding.probes import trace_camera_probes
 from warp_ir.metrics import z_scores
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
@@ -204,7 +204,7 @@ def test_both_halves_of_the_pilot_see_the_picture():
     """What is learned from one half of the camera paths is measured by the other: both are spread over the image."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=64, height=64, filter=False))
     camera = renderer._moments[0].camera
-    seen = look(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
+    seen = trace_camera_probes(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
     middle = np.median(seen.position[seen.bounce == 0, :2], axis=0)
     for half in (seen.even, ~seen.even):
         beyond = (seen.position[half & (seen.bounce == 0), :2] > middle).mean(axis=0)

@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from tests.physics.closed_form import unit_shape
-from warp_ir.sampling.solid_angle import aim_at, aim_density
+from warp_ir.sampling.solid_angle import sample_solid_angle, solid_angle_pdf
 from warp_ir.scene import LightKind
 
 wp.set_module_options({"enable_backward": False})
@@ -29,11 +29,11 @@ def _aim(
     density: wp.array2d[wp.float32],
 ):
     i = first + wp.tid()
-    aim = aim_at(kind, axes, inverse, to_light, u[i])
+    aim = sample_solid_angle(kind, axes, inverse, to_light, u[i])
     way[i] = aim.way
-    density[0, i] = aim.density
-    if aim.density > 0.0:
-        density[1, i] = aim_density(kind, axes, inverse, to_light, wp.normalize(aim.way))
+    density[0, i] = aim.pdf
+    if aim.pdf > 0.0:
+        density[1, i] = solid_angle_pdf(kind, axes, inverse, to_light, wp.normalize(aim.way))
 
 
 @pytest.fixture(scope="module")

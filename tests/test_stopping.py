@@ -8,7 +8,7 @@ import pytest
 import warp_ir as ir
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
-from warp_ir.scheduling import Stopping, worthwhile
+from warp_ir.scheduling import AdaptiveScheduler, select_tiles
 
 SETTINGS = ir.RenderSettings(width=36, height=20, light_paths=64)  # 5 x 3 tiles, some of which reach beyond
 
@@ -21,23 +21,23 @@ def pixels_of(tiles, film):
 
 def test_equal_tiles_are_all_worth_it():
     """Where no tile is better than another, an iteration's fixed cost is best spent on all of them."""
-    assert worthwhile(np.full(64, 0.1), np.full(64, 4, np.int32)).all()
+    assert select_tiles(np.full(64, 0.1), np.full(64, 4, np.int32)).all()
 
 
 def test_no_fewer_than_an_eighth():
     """If one tile has all the error, cores have an eighth to work on: that one among them."""
     squares = np.zeros(64)
     squares[37] = 1.0
-    chosen = worthwhile(squares, np.full(64, 4, np.int32))
+    chosen = select_tiles(squares, np.full(64, 4, np.int32))
     assert chosen.sum() == 8 and chosen[37]
 
 
 def test_all_tiles_have_two_iterations_if_there_is_time():
     """After one, all are chosen, or as many as there is time for: the worst; all again if that is next to none."""
     squares, once = np.arange(64.0), np.ones(64, np.int32)
-    assert worthwhile(squares, once).all()
-    np.testing.assert_array_equal(np.flatnonzero(worthwhile(squares, once, most=20.5)), np.arange(44, 64))
-    assert worthwhile(squares, once, most=7.0).all()
+    assert select_tiles(squares, once).all()
+    np.testing.assert_array_equal(np.flatnonzero(select_tiles(squares, once, most=20.5)), np.arange(44, 64))
+    assert select_tiles(squares, once, most=7.0).all()
 
 
 def test_iterations_go_with_the_root_of_the_error():
@@ -50,7 +50,7 @@ def test_iterations_go_with_the_root_of_the_error():
     errors = np.random.default_rng(1).random(256) + 0.1
     n = np.full(256, 2, np.int32)
     while n.sum() < 256 * 40:
-        n += worthwhile(errors / n, n)
+        n += select_tiles(errors / n, n)
     best, free = np.sqrt(errors).sum() ** 2 / n.sum(), n < n.max() - 2
     assert best <= (errors / n).sum() < 1.02 * best < 0.96 * 256 * errors.sum() / n.sum()
     ratio = n[free] / np.sqrt(errors[free])
@@ -154,7 +154,7 @@ def test_the_time_that_is_left_goes_to_the_worst_tiles():
         settings = ir.RenderSettings(width=36, height=20, light_paths=64, time_limit=limit)
         renderer = Renderer(cornell_box(), settings)
         film = renderer.new_film()
-        stopping = Stopping(film, settings, True)
+        stopping = AdaptiveScheduler(film, settings, True)
         renderer.add_iteration(film, 0)
         film.seconds = 1.0
         report = stopping.look(0.0, 0.2)

@@ -9,13 +9,13 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher, carve, floats
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher, floats, partition
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.lights import lights_found, surface_seen
+from warp_ir.lights import emission_to_camera, intersect_lights
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_disk
-from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, smooth_rise
-from warp_ir.tiles import Tiles, all_tiles, indices, missed_at, pixel_at
+from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, terminator_offset
+from warp_ir.tiles import Tiles, all_tiles, indices, pixel_at, skipped_iterations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -24,7 +24,7 @@ _JITTER = wp.constant(wp.uint32(0x6A09E667))
 
 
 @wp.struct
-class Anchor:
+class SurfacePoint:
     """A point of a triangle, wherever that goes while the shutter is open."""
 
     triangle: int
@@ -44,7 +44,7 @@ class GBuffer:
     albedo: wp.array[wp.vec3]
     emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection; empty: there can be none
     depth: wp.array[wp.float32]  # along the camera's -Z
-    anchor: wp.array[Anchor]  # no rows if no surface moves while the shutter is open
+    surface_point: wp.array[SurfacePoint]  # no rows if no surface moves while the shutter is open
     tiles: Tiles  # the pixels that are looked through; rows of others are of no meaning
 
 
@@ -99,7 +99,7 @@ def image_pixel(camera: CameraData, pixel: int) -> int:
 
 
 @wp.struct
-class Sight:
+class CameraHit:
     """What a camera ray meets; `mesh` is -1 for the background."""
 
     mesh: int
@@ -114,9 +114,9 @@ class Sight:
 
 
 @wp.func
-def anchor_of(hit: Hit) -> Anchor:
+def surface_point_of(hit: Hit) -> SurfacePoint:
     """Where a hit is on its triangle."""
-    out = Anchor()
+    out = SurfacePoint()
     out.triangle = hit.triangle
     out.instance = hit.instance
     u = wp.uint32(wp.clamp(hit.u, 0.0, 1.0) * 65535.0)
@@ -126,7 +126,7 @@ def anchor_of(hit: Hit) -> Anchor:
 
 
 @wp.func
-def _visible_span(camera: CameraData, ray: Ray) -> wp.vec2:
+def _clip_interval(camera: CameraData, ray: Ray) -> wp.vec2:
     """Nearest and farthest depth at which a camera ray sees anything; the same if it does not at all."""
     near = camera.near
     far = camera.far
@@ -147,16 +147,16 @@ def _visible_span(camera: CameraData, ray: Ray) -> wp.vec2:
 
 
 @wp.func
-def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
+def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHit:
     """Follows a camera ray."""
-    span = _visible_span(camera, ray)
+    span = _clip_interval(camera, ray)
     near = span[0]
     origin = ray.origin + ray.direction * near
     reach = span[1] - near
     hit = closest(scene, origin, ray.direction, reach)
     length = wp.length(ray.direction)
     towards = ray.direction / length
-    sight = Sight()
+    sight = CameraHit()
     sight.mesh = -1
     if hit.triangle >= 0:
         sight.hit = hit
@@ -164,7 +164,7 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.position = hit.position
         sight.normal = hit.normal
         sight.shading_normal = shading_normal(scene, hit)
-        rise = smooth_rise(scene, hit)
+        rise = terminator_offset(scene, hit)
         if wp.length_sq(rise) > 0.0:
             sight.position += rise
             sight.normal = sight.shading_normal
@@ -174,10 +174,10 @@ def see(scene: SceneData, camera: CameraData, ray: Ray) -> Sight:
         sight.smooth_normal = sight.shading_normal
         sight.shading_normal = mapped_normal(scene, hit, sight.smooth_normal, pixel)
         sight.albedo = albedo(scene, hit, pixel)
-        sight.emission = surface_seen(scene, hit, towards, pixel)
+        sight.emission = emission_to_camera(scene, hit, towards, pixel)
         reach = hit.t
-    if camera.shows_lights == 1:
-        sight.emission += lights_found(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
+    if camera.visible_lights == 1:
+        sight.emission += intersect_lights(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
     return sight
 
 
@@ -201,7 +201,7 @@ def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int,
     return square_to_disk(sobol.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
 ) -> None:
@@ -213,10 +213,10 @@ def _trace_primary(
     place = wp.vec2(0.5, 0.5)
     lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
-        sample = iteration - missed_at(gbuffer.tiles, index)  # a pixel leaves out no point of its sequence
+        sample = iteration - skipped_iterations(gbuffer.tiles, index)  # a pixel leaves out no point of its sequence
         place = jitter(scene, camera, pixel, sample, seed)
         lens = lens_point(scene, camera, pixel, sample, seed)
-    sight = see(scene, camera, camera_ray(camera, pixel, place, lens))
+    sight = trace_camera_ray(scene, camera, camera_ray(camera, pixel, place, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
     gbuffer.normal[pixel] = sight.normal
@@ -226,8 +226,8 @@ def _trace_primary(
     if gbuffer.emission.shape[0] > 0:
         gbuffer.emission[pixel] = sight.emission
     gbuffer.depth[pixel] = sight.depth
-    if gbuffer.anchor.shape[0] > 0:
-        gbuffer.anchor[pixel] = anchor_of(sight.hit)
+    if gbuffer.surface_point.shape[0] > 0:
+        gbuffer.surface_point[pixel] = surface_point_of(sight.hit)
 
 
 def new_gbuffer(
@@ -245,13 +245,13 @@ def new_gbuffer(
     types = [*[wp.vec3] * (len(vectors) + 1), wp.int32, wp.float32]
     pixels = columns * rows
     block = launcher.empty(pixels * max(floats(*types), spare), wp.float32)
-    *arrays, indirect, mesh, depth = carve(block, pixels, types)
+    *arrays, indirect, mesh, depth = partition(block, pixels, types)
     gbuffer = GBuffer()
     gbuffer.mesh, gbuffer.depth = mesh, depth
     gbuffer.tiles = all_tiles(columns, rows, launcher)
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)
-    gbuffer.anchor = launcher.empty(pixels if moving else 0, Anchor)
+    gbuffer.surface_point = launcher.empty(pixels if moving else 0, SurfacePoint)
     if not glows:
         gbuffer.emission = launcher.empty(0, wp.vec3)
     if not mapped:

@@ -1,6 +1,6 @@
 """What UsdLux adds to the physics of a light: shaping of its emission, links, and shadows that are not cast.
 
-Only lights that ask for any of it have a `LightControl`; a scene without one pays a comparison.
+Only lights that ask for any of it have a `LightModifiers`; a scene without one pays a comparison.
 """
 
 import math
@@ -12,7 +12,13 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.sampling.distribution2d import GridList, GridTables, cell_means, cell_measure, value_along
+from warp_ir.sampling.distribution2d import (
+    Distribution2DList,
+    Distribution2DTables,
+    cell_means,
+    cell_measure,
+    value_along,
+)
 from warp_ir.scene import InputError, Light, LightKind, Mesh, MeshLight, Shaping
 
 wp.set_module_options({"enable_backward": False})
@@ -20,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 _BANDS = 1024
 """Rows of the table from which the photons of a shaped light take their directions."""
 _LEAST = 0.05
-"""Smallest `emphasis` in the support of a shaped light: what is dim there is found now and then."""
+"""Smallest `approximate_shaping` in the support of a shaped light: what is dim there is found now and then."""
 _ALONG = 0.999999
 """Cosine to the axis of shaping above which a flat light faces along it."""
 _SPHERE_WASTE = 8.0 / 3.0
@@ -28,7 +34,7 @@ _SPHERE_WASTE = 8.0 / 3.0
 
 
 @wp.struct
-class LightControl:
+class LightModifiers:
     """One light's."""
 
     frame: wp.mat33  # rows: the light's +X, +Y and the axis of shaping, its -Z
@@ -39,7 +45,7 @@ class LightControl:
     tint: wp.vec3
     profile: int  # grid of factors; -1: none
     photons: int  # grid of directions; -1: photons leave as from an unshaped light, with the factor as a weight
-    slope: float  # how `emphasis` goes with the cosine to the axis
+    slope: float  # how `approximate_shaping` goes with the cosine to the axis
     offset: float
     least: float
     cutoff: float  # cosine to the axis below which the light is dark
@@ -49,7 +55,7 @@ class LightControl:
 
 
 @wp.struct
-class ControlTables:
+class LightModifierTables:
     """All controls of a scene."""
 
     count: int
@@ -57,7 +63,7 @@ class ControlTables:
     of_light: wp.array[wp.int32]  # [lights], row of `rows` or -1
     surface_count: int  # meshes with a control
     of_mesh: wp.array[wp.int32]  # [meshes], likewise; one row if none has any
-    rows: wp.array[LightControl]
+    rows: wp.array[LightModifiers]
     meshes: int
     links: wp.array[wp.int32]  # [link rows x meshes], 1: the mesh is in the set
     sampled_count: int  # lights with an area that see other surfaces than rays do
@@ -66,57 +72,59 @@ class ControlTables:
 
 
 @wp.func(inline=False)
-def shaping_factor(control: LightControl, grids: GridTables, direction: wp.vec3) -> wp.vec3:
+def shaping_factor(modifiers: LightModifiers, distributions: Distribution2DTables, direction: wp.vec3) -> wp.vec3:
     """Factor of the radiance that a light emits along a unit direction."""
     out = wp.vec3(1.0)
-    if control.shaped == 0:
+    if modifiers.shaped == 0:
         return out
-    d = control.frame * direction
+    d = modifiers.frame * direction
     theta = wp.atan2(wp.sqrt(d[0] * d[0] + d[1] * d[1]), d[2])
-    if theta > control.edge:
+    if theta > modifiers.edge:
         return wp.vec3(0.0)
-    if theta > control.fade:
-        t = (theta - control.fade) / (control.edge - control.fade)
+    if theta > modifiers.fade:
+        t = (theta - modifiers.fade) / (modifiers.edge - modifiers.fade)
         out = out * (1.0 - t * t * (3.0 - 2.0 * t))
-    if control.focus > 0.0:
-        f = wp.pow(wp.min(wp.abs(d[2]), 1.0), control.focus)
-        out = wp.cw_mul(out, wp.vec3(f) + control.tint * (1.0 - f))
-    if control.profile >= 0:
-        out = wp.cw_mul(out, value_along(grids, control.profile, d))
+    if modifiers.focus > 0.0:
+        f = wp.pow(wp.min(wp.abs(d[2]), 1.0), modifiers.focus)
+        out = wp.cw_mul(out, wp.vec3(f) + modifiers.tint * (1.0 - f))
+    if modifiers.profile >= 0:
+        out = wp.cw_mul(out, value_along(distributions, modifiers.profile, d))
     return out
 
 
 @wp.func
-def emphasis(control: LightControl, position: wp.vec3, target: wp.vec4) -> float:
+def approximate_shaping(modifiers: LightModifiers, position: wp.vec3, target: wp.vec4) -> float:
     """Roughly the factor from a point on a light towards a position, never 0: for weighing VPLs, not for light."""
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
-    cosine = -wp.dot(wp.vec3(control.frame[2, 0], control.frame[2, 1], control.frame[2, 2]), wp.normalize(to_light))
-    return wp.clamp(control.slope * cosine + control.offset, control.least, 1.0)
+    cosine = -wp.dot(
+        wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2]), wp.normalize(to_light)
+    )
+    return wp.clamp(modifiers.slope * cosine + modifiers.offset, modifiers.least, 1.0)
 
 
 @wp.func
-def linked(tables: ControlTables, row: int, mesh: int) -> bool:
+def in_link_set(tables: LightModifierTables, row: int, mesh: int) -> bool:
     """Whether a mesh is in a set of the link table; row -1 is the empty set."""
     if row < 0 or mesh < 0:
         return False
     return tables.links[row * tables.meshes + mesh] == 1
 
 
-def needs_control(light: Light | MeshLight) -> bool:
+def needs_modifiers(light: Light | MeshLight) -> bool:
     """Whether a light asks for anything beyond its radiance and shape."""
     return light.shaping is not None or not light.shadows or bool(light.unlit) or bool(light.shadowless)
 
 
-def upload_controls(
-    lights: tuple[Light, ...], axes: Any, meshes: Sequence[Mesh], grids: GridList, launcher: Launcher
+def upload_light_modifiers(
+    lights: tuple[Light, ...], axes: Any, meshes: Sequence[Mesh], distributions: Distribution2DList, launcher: Launcher
 ) -> tuple[Any, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The `ControlTables`, and for every light what shaping makes of its radiance and of its power.
+    """The `LightModifierTables`, and for every light what shaping makes of its radiance and of its power.
 
     Args:
         lights: Of the scene.
         axes: Their axes in the device's frame [lights, 3, 3]; the third column of a flat light is its unit normal.
         meshes: Of the scene; those that are lights have controls too.
-        grids: Takes the profiles and the directions of photons.
+        distributions: Takes the profiles and the directions of photons.
         launcher: Where to.
 
     Returns:
@@ -126,11 +134,11 @@ def upload_controls(
     Raises:
         InputError: A value is not usable; the message names the light.
     """
-    rows = _Rows(len(meshes), grids)
+    rows = _Rows(len(meshes), distributions)
     of_light = np.full(max(len(lights), 1), -1, np.int32)
     radiance, power = np.ones(len(lights)), np.ones(len(lights))
     for k, light in enumerate(lights):
-        if not needs_control(light):
+        if not needs_modifiers(light):
             continue
         if light.shaping is not None and light.shaping.profile is not None:
             _check(light.name, light.shaping)
@@ -141,7 +149,7 @@ def upload_controls(
         power[k] = share if light.kind != LightKind.DISTANT else 1.0  # whose directions lie around the axis anyway
     of_mesh = np.full(len(meshes), -1, np.int32)
     for k, mesh in enumerate(meshes):
-        if mesh.light is not None and needs_control(mesh.light):
+        if mesh.light is not None and needs_modifiers(mesh.light):
             of_mesh[k] = len(rows.rows)
             rows.add(mesh.light, flat=_is_flat(mesh, _axis(mesh.light)))
 
@@ -160,9 +168,9 @@ def upload_controls(
 class _Rows:
     """The rows of controls and links while they are gathered."""
 
-    def __init__(self, meshes: int, grids: GridList) -> None:
+    def __init__(self, meshes: int, distributions: Distribution2DList) -> None:
         self.rows: list[tuple[Any, ...]] = []
-        self._meshes, self._grids = meshes, grids
+        self._meshes, self._grids = meshes, distributions
         self._links: dict[frozenset[int], int] = {}
 
     def add(
@@ -206,13 +214,13 @@ class _Rows:
         return share
 
     def upload(self, launcher: Launcher) -> Any:
-        """The `ControlTables` with rows and links."""
-        out = ControlTables()
+        """The `LightModifierTables` with rows and links."""
+        out = LightModifierTables()
         out.count = len(self.rows)
-        table = np.zeros(max(len(self.rows), 1), LightControl.numpy_dtype())
+        table = np.zeros(max(len(self.rows), 1), LightModifiers.numpy_dtype())
         for k, row in enumerate(self.rows):
             table[k] = row
-        out.rows = launcher.array(table, LightControl)
+        out.rows = launcher.array(table, LightModifiers)
         out.meshes = self._meshes
         bits = np.zeros((max(len(self._links), 1), max(self._meshes, 1)), np.int32)
         for link, index in self._links.items():

@@ -44,7 +44,7 @@ from warp_ir.memory import pixel_bytes
 from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling.sobol import iteration_scramble, stratum
 from warp_ir.scene import InputError, Scene
-from warp_ir.scheduling import Progress, Stopping
+from warp_ir.scheduling import AdaptiveScheduler, Progress
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl.emission import Vpls, emit_vpls, to_host
 from warp_ir.vpl.guide import unguided
@@ -73,7 +73,7 @@ class Renderer:
         self.launcher = Launcher(device, threads)
         self._check_memory(scene)
         self._told: tuple[dict[str, float], dict[str, int]] = ({}, {})
-        self._moments: list[_Moment] = []
+        self._moments: list[_ShutterState] = []
         self._needs: dict[str, Any] = {}  # of the buffers
         large, small = _modules(settings.estimator)
         with self.launcher.loading():
@@ -107,7 +107,7 @@ class Renderer:
             camera = camera_data(moment.camera, data.frame, settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
             estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
-            self._moments.append(_Moment(data, camera, estimator, moment.camera.exposure))
+            self._moments.append(_ShutterState(data, camera, estimator, moment.camera.exposure))
         if camera.blurs and settings.filters:
             launcher.load([warp_ir.reconstruction.blur])
         needs = {
@@ -153,7 +153,7 @@ class Renderer:
         number = stratum(iteration, len(self._moments).bit_length() - 1)
         moment = self._moments[number]
         moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
-        with self.launcher.phase("film"), self.launcher.undisturbed():  # no part of an iteration without the rest
+        with self.launcher.phase("film"), self.launcher.uninterruptible():  # no part of an iteration without the rest
             film.add(self._gbuffer, self._direct, self._indirect, moment.exposure, number)
         wp.synchronize_device(self.launcher.device)
 
@@ -169,7 +169,7 @@ class Renderer:
         film = film or self.new_film()
         start = time.perf_counter() - film.seconds
         with _signals_cancel(self.launcher, film):
-            stopping, profile = Stopping(film, self.settings, self._chooses_tiles()), self.launcher.profile
+            stopping, profile = AdaptiveScheduler(film, self.settings, self._chooses_tiles()), self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
             while not film.interrupted and film.iterations < self.settings.iteration_limit:
                 try:
@@ -220,7 +220,7 @@ class Renderer:
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _ShutterState:
     """The scene while the shutter is open: all of it, or one of the moments that stand for the time."""
 
     scene: DeviceScene

@@ -43,7 +43,7 @@ class Progress:
     """Estimate of what remains [s]; NaN if unknown."""
 
 
-class Stopping:
+class AdaptiveScheduler:
     """Watches a film while iterations are added to it, and chooses the tiles of the next."""
 
     def __init__(self, film: Film, settings: RenderSettings, chooses: bool) -> None:
@@ -75,7 +75,7 @@ class Stopping:
             if due:
                 self._error = math.sqrt(squares.sum())
             if self._chooses:
-                film.choose(worthwhile(squares, film.tile_iterations, most))
+                film.choose(select_tiles(squares, film.tile_iterations, most))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())
 
     def _progress(self, needed: float) -> Progress:
@@ -94,7 +94,7 @@ class Stopping:
         return Progress(film.iterations, film.seconds, error, fraction, left)
 
 
-def worthwhile(squares: Floats, iterations: npt.NDArray[np.int32], most: float = math.inf) -> Mask:
+def select_tiles(squares: Floats, iterations: npt.NDArray[np.int32], most: float = math.inf) -> Mask:
     """Which tiles the next iteration should be for, bool [tiles].
 
     Args:

@@ -10,7 +10,7 @@ of a ray into the prototype's space and that of the hit back add to the error.
 import warp as wp
 
 from warp_ir.bvh import RayHit, intersect, intersect_instances
-from warp_ir.device_scene import INSTANCE_COLOR, Patterns, SceneData
+from warp_ir.device_scene import INSTANCE_COLOR, SceneData, SurfaceTextures
 from warp_ir.sampling.sobol import hash_combine
 from warp_ir.texture import coordinates, lookup, mip_level
 
@@ -64,7 +64,7 @@ def _start(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float, direction: wp
 
 
 @wp.func
-def leave(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
+def spawn_ray_origin(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
     """Where rays may start near a hit; `direction` as for `offset`."""
     a = scene.points[scene.indices[3 * hit.triangle]]
     b = scene.points[scene.indices[3 * hit.triangle + 1]]
@@ -80,15 +80,15 @@ def leave(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _uv_at(patterns: Patterns, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
+def _uv_at(surface_textures: SurfaceTextures, triangle: int, uv_set: int, u: float, v: float) -> wp.vec3:
     """Texture coordinates at a point of a triangle, and the area of the triangle's image in the uv plane."""
-    row = patterns.triangle_uvs[triangle]
+    row = surface_textures.triangle_uvs[triangle]
     if row < 0:
         return wp.vec3(0.0)
     row += 3 * uv_set
-    a = patterns.corner_uvs[row]
-    b = patterns.corner_uvs[row + 1]
-    c = patterns.corner_uvs[row + 2]
+    a = surface_textures.corner_uvs[row]
+    b = surface_textures.corner_uvs[row + 1]
+    c = surface_textures.corner_uvs[row + 2]
     uv = u * a + v * b + (1.0 - u - v) * c
     ab = b - a
     ac = c - a
@@ -97,10 +97,16 @@ def _uv_at(patterns: Patterns, triangle: int, uv_set: int, u: float, v: float) -
 
 @wp.func(inline=False)  # so that scenes without textures do not carry the code about
 def _textured(
-    patterns: wp.array[Patterns], texture: int, triangle: int, u: float, v: float, area: float, footprint: float
+    surface_textures: wp.array[SurfaceTextures],
+    texture: int,
+    triangle: int,
+    u: float,
+    v: float,
+    area: float,
+    footprint: float,
 ) -> wp.vec3:
     """A texture at a point of a triangle, as the mean over a patch as wide as `footprint`; 0: as sharp as it is."""
-    p = patterns[0]
+    p = surface_textures[0]
     row = p.textures.rows[texture]
     uv = _uv_at(p, triangle, row.uv_set, u, v)
     level = mip_level(p.textures, row, uv[2] / area, footprint)
@@ -108,14 +114,14 @@ def _textured(
 
 
 @wp.func
-def presence(scene: SceneData, triangle: int, u: float, v: float) -> float:
+def alpha_at(scene: SceneData, triangle: int, u: float, v: float) -> float:
     """The share of the rays that meet the surface at a point of a triangle: its opacity, or 0 or 1 with a cutoff."""
     material = scene.triangle_material[triangle]
     opacity = scene.opacity[material]
     if opacity >= 1.0:
         return 1.0
     if scene.opacity_texture[material] >= 0:
-        opacity = _textured(scene.patterns, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
+        opacity = _textured(scene.surface_textures, scene.opacity_texture[material], triangle, u, v, 1.0, 0.0)[0]
     cutoff = scene.cutoff[material]
     if cutoff > 0.0:
         return wp.where(opacity < cutoff, 0.0, 1.0)
@@ -123,9 +129,9 @@ def presence(scene: SceneData, triangle: int, u: float, v: float) -> float:
 
 
 @wp.func
-def _is_open(scene: SceneData, triangle: int, u: float, v: float) -> bool:
+def _passes_through(scene: SceneData, triangle: int, u: float, v: float) -> bool:
     """Whether a ray passes a triangle where it meets it; the same ray always does."""
-    there = presence(scene, triangle, u, v)
+    there = alpha_at(scene, triangle, u, v)
     if there <= 0.0 or there >= 1.0:
         return there <= 0.0
     bits = hash_combine(hash_combine(wp.uint32(triangle), wp.cast(u, wp.uint32)), wp.cast(v, wp.uint32))
@@ -146,7 +152,7 @@ def scene_at(address: wp.uint64) -> wp.array[SceneData]:
 
 
 @wp.func(inline=False)  # the only traversal in a kernel: many copies of it would compile slowly and run no faster
-def _meet(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool) -> RayHit:
+def _intersect(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool) -> RayHit:
     """The nearest triangle along a ray, open or not; with `any_hit` some, without its coordinates."""
     scene = scene_at(address)[0]
     found = intersect(scene.bvh, origin, direction, t_max, any_hit)
@@ -158,12 +164,12 @@ def _meet(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float,
 
 
 @wp.func
-def _nearest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
+def _closest_triangle(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """The nearest triangle along a ray, open or not."""
     hit = Hit()
     hit.triangle = -1
     hit.instance = -1
-    found = _meet(address, origin, direction, t_max, False)
+    found = _intersect(address, origin, direction, t_max, False)
     if found.triangle >= 0:
         scene = scene_at(address)[0]
         hit.triangle = found.triangle
@@ -187,32 +193,32 @@ def _nearest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: flo
         n = wp.normalize(n)
         hit.normal = wp.where(hit.front == 1, n, -n)
         # Back the way the ray came as well: it has crossed nothing, not even a wall that stands on this triangle.
-        hit.position = leave(scene, hit, hit.normal - wp.normalize(direction))
+        hit.position = spawn_ray_origin(scene, hit, hit.normal - wp.normalize(direction))
     return hit
 
 
 @wp.func
-def _way(origin: wp.vec3, target: wp.vec4) -> wp.vec3:
+def _to_target(origin: wp.vec3, target: wp.vec4) -> wp.vec3:
     return wp.vec3(target[0], target[1], target[2]) - origin * target[3]
 
 
 @wp.func(inline=False)
-def _nearest_present(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max: float) -> Hit:
+def _closest_opaque(address: wp.uint64, origin: wp.vec3, target: wp.vec4, t_max: float) -> Hit:
     """The nearest triangle on the way to a homogeneous point that is there where the ray meets it."""
-    along = _way(origin, target)
+    along = _to_target(origin, target)
     start = origin
     passed = float(0.0)
     for _layer in range(_MOST_LAYERS):
         # Every step off a surface moves the ray a little: it is aimed anew, or not only the last surface would end it.
-        way = _way(start, target)
-        hit = _nearest(address, start, way, wp.where(target[3] == 0.0, t_max - passed, t_max))
+        way = _to_target(start, target)
+        hit = _closest_triangle(address, start, way, wp.where(target[3] == 0.0, t_max - passed, t_max))
         if hit.triangle < 0:
             return hit
         scene = scene_at(address)[0]
-        if not _is_open(scene, hit.triangle, hit.u, hit.v):
+        if not _passes_through(scene, hit.triangle, hit.u, hit.v):
             hit.t += passed
             return hit
-        start = leave(scene, hit, wp.normalize(way) - hit.normal)
+        start = spawn_ray_origin(scene, hit, wp.normalize(way) - hit.normal)
         passed = wp.dot(start - origin, along) / wp.length_sq(along)
         if passed >= t_max:
             break
@@ -231,19 +237,19 @@ def closest(scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float)
 @wp.func(inline=False)
 def _closest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     scene = scene_at(address)[0]
-    if scene.open_count > 0:
+    if scene.non_opaque_count > 0:
         target = wp.vec4(direction[0], direction[1], direction[2], 0.0)
-        return _nearest_present(address, origin, target, t_max)
-    return _nearest(address, origin, direction, t_max)
+        return _closest_opaque(address, origin, target, t_max)
+    return _closest_triangle(address, origin, direction, t_max)
 
 
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether nothing lies between a point and a homogeneous one (w = 0: a direction); both off their surfaces."""
     reach = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
-    if scene.open_count > 0:
-        return _nearest_present(scene.address, origin, target, reach).triangle < 0
-    return _meet(scene.address, origin, _way(origin, target), reach, True).triangle < 0
+    if scene.non_opaque_count > 0:
+        return _closest_opaque(scene.address, origin, target, reach).triangle < 0
+    return _intersect(scene.address, origin, _to_target(origin, target), reach, True).triangle < 0
 
 
 @wp.func
@@ -271,7 +277,7 @@ def shading_normal(scene: SceneData, hit: Hit) -> wp.vec3:
 def _mapped(address: wp.uint64, hit: Hit, normal: wp.vec3, footprint: float) -> wp.vec3:
     """The normal that a material's texture makes of a unit `normal` on the side that was hit."""
     scene = scene_at(address)[0]
-    p = scene.patterns[0]
+    p = scene.surface_textures[0]
     texture = p.normal_texture[scene.triangle_material[hit.triangle]]
     uvs = p.triangle_uvs[hit.triangle]
     if texture < 0 or uvs < 0:
@@ -326,7 +332,7 @@ def mapped_normal(scene: SceneData, hit: Hit, normal: wp.vec3, footprint: float)
 
 
 @wp.func
-def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
+def terminator_offset(scene: SceneData, hit: Hit) -> wp.vec3:
     """From a hit to the smooth surface that its triangle's normals stand for; zero where that is not above it.
 
     The point is projected onto the planes of the corners and their normals, and the results are interpolated (Hanika
@@ -335,11 +341,11 @@ def smooth_rise(scene: SceneData, hit: Hit) -> wp.vec3:
     """
     if scene.triangle_normals[hit.triangle] < 0:
         return wp.vec3(0.0)
-    return _smooth_rise(scene.address, hit)
+    return _terminator_offset(scene.address, hit)
 
 
 @wp.func(inline=False)
-def _smooth_rise(address: wp.uint64, hit: Hit) -> wp.vec3:
+def _terminator_offset(address: wp.uint64, hit: Hit) -> wp.vec3:
     scene = scene_at(address)[0]
     row = scene.triangle_normals[hit.triangle]
     rise = wp.vec3(0.0)
@@ -355,7 +361,7 @@ def _smooth_rise(address: wp.uint64, hit: Hit) -> wp.vec3:
         rise += weight * wp.max(below, 0.0) * n
     # What stands on the surface, or close above it, must stay above the point.
     if wp.length_sq(rise) > 0.0:
-        if _meet(address, hit.position, rise, 2.0, True).triangle >= 0:
+        if _intersect(address, hit.position, rise, 2.0, True).triangle >= 0:
             return wp.vec3(0.0)
     return rise
 
@@ -367,7 +373,7 @@ def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if scene.texture_count > 0:
         if scene.albedo_texture[material] >= 0:
             return _textured(
-                scene.patterns, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
+                scene.surface_textures, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
             )
     row = scene.triangle_colors[hit.triangle]
     if row == _INSTANCE:
@@ -387,7 +393,7 @@ def emitted(scene: SceneData, triangle: int, u: float, v: float, area: float, fo
     material = scene.triangle_material[triangle]
     if scene.texture_count > 0:
         if scene.emission_texture[material] >= 0:
-            return _textured(scene.patterns, scene.emission_texture[material], triangle, u, v, area, footprint)
+            return _textured(scene.surface_textures, scene.emission_texture[material], triangle, u, v, area, footprint)
     return scene.emission[material]
 
 
@@ -404,7 +410,7 @@ def has_glow(scene: SceneData, triangle: int) -> bool:
     """Whether the camera sees something else of a triangle than the `emission` by which it lights the scene."""
     if scene.glow_count == 0:
         return False
-    return scene.patterns[0].glow[scene.triangle_material[triangle]][0] >= 0.0
+    return scene.surface_textures[0].glow[scene.triangle_material[triangle]][0] >= 0.0
 
 
 @wp.func
@@ -413,7 +419,7 @@ def glow(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if hit.front == 0 and scene.emits_back[hit.triangle] == 0:
         return wp.vec3(0.0)
     material = scene.triangle_material[hit.triangle]
-    texture = scene.patterns[0].glow_texture[material]
+    texture = scene.surface_textures[0].glow_texture[material]
     if texture >= 0:
-        return _textured(scene.patterns, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
-    return scene.patterns[0].glow[material]
+        return _textured(scene.surface_textures, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
+    return scene.surface_textures[0].glow[material]

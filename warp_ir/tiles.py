@@ -25,7 +25,7 @@ class Tiles:
     rows: int
     pixels: int  # in these tiles
     numbers: wp.array[wp.int32]  # row by row; those at the right and at the bottom may reach beyond the film
-    missed: wp.array[wp.int32]  # iterations so far that were not for a tile, of all tiles of the film
+    skipped: wp.array[wp.int32]  # iterations so far that were not for a tile, of all tiles of the film
 
 
 @wp.func
@@ -46,9 +46,9 @@ def pixel_at(tiles: Tiles, index: int) -> int:
 
 
 @wp.func
-def missed_at(tiles: Tiles, index: int) -> int:
+def skipped_iterations(tiles: Tiles, index: int) -> int:
     """How many iterations so far were not for that pixel."""
-    return int(tiles.missed[tiles.numbers[index // (TILE * TILE)]])
+    return int(tiles.skipped[tiles.numbers[index // (TILE * TILE)]])
 
 
 def all_tiles(columns: int, rows: int, launcher: Launcher) -> Any:
@@ -58,12 +58,12 @@ def all_tiles(columns: int, rows: int, launcher: Launcher) -> Any:
 
 
 def some_tiles(
-    which: npt.NDArray[np.bool_], missed: npt.NDArray[np.int32], columns: int, rows: int, launcher: Launcher
+    which: npt.NDArray[np.bool_], skipped: npt.NDArray[np.int32], columns: int, rows: int, launcher: Launcher
 ) -> Any:
-    """Those `Tiles` for which `which` [tiles] is true; `missed` [tiles] are iterations that have left one out."""
+    """Those `Tiles` for which `which` [tiles] is true; `skipped` [tiles] are iterations that have left one out."""
     tiles = Tiles()
     tiles.columns, tiles.rows = columns, rows
-    tiles.numbers, tiles.missed = launcher.array(np.flatnonzero(which), wp.int32), launcher.array(missed, wp.int32)
+    tiles.numbers, tiles.skipped = launcher.array(np.flatnonzero(which), wp.int32), launcher.array(skipped, wp.int32)
     heights, widths = (np.minimum(TILE, size - np.arange(0, size, TILE)) for size in (rows, columns))
     tiles.pixels = int(heights @ which.reshape(len(heights), -1) @ widths)
     return tiles

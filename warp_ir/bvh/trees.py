@@ -11,7 +11,7 @@ from warp_ir.bvh.build import build_tree, concatenated, tree_address, tree_size
 from warp_ir.bvh.node_layout import Bvh, MeshTree, vec8, vec8i
 from warp_ir.bvh.refit import box_of, refit_tree, warp_cost, wide_cost
 from warp_ir.bvh.top_level import build_top
-from warp_ir.device.launcher import Launcher, copied
+from warp_ir.device.launcher import Launcher, copy_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,7 +140,7 @@ class Trees:
                 row += getattr(top, name).shape[0]
 
     def _world(self, world: Sequence[int], root: int) -> Any:
-        out = copied(self._bvh)
+        out = copy_record(self._bvh)
         out.root, out.world_count = root, len(world)
         if self._launcher.device.is_cuda:
             out.root = len(self._trees)

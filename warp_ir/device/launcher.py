@@ -5,7 +5,7 @@ indices that Python threads take in turn. The convention that makes this possibl
 of every kernel of this package is ``first: int``, and its index is ``first + wp.tid()``. Kernels write
 only what their index owns, so the cut cannot be seen in the result.
 
-What is short, or done on the host, keeps one thread busy: `Launcher.beside` gives the others something to do.
+What is short, or done on the host, keeps one thread busy: `Launcher.overlap` gives the others something to do.
 """
 
 import math
@@ -31,7 +31,7 @@ _MOST_BANDS = 64
 _LEAST_SECONDS = 1.0e-4
 """What a band should take at least: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
-MOST_REGISTERS = 168
+MAX_REGISTERS = 168
 """Of a CUDA thread, in kernels that trace rays. Left alone they take 255, and a multiprocessor has room for 256 threads
 to hide each other's waiting; so it has for 384. What does not fit is kept in memory, mostly by callers while rays are
 followed. The number is what Blender's Cycles uses (kernel/device/cuda/config.h); here it has not been measured yet."""
@@ -89,7 +89,7 @@ class Launcher:
         self._beside: str | None = None  # phase of the launches that nobody waits for
         self._whole = False
         self._cancelled = threading.Event()
-        self._kept: dict[str, Any] = {}
+        self._scratch: dict[str, Any] = {}
         self._tables: dict[str, tuple[npt.NDArray[Any], Any]] = {}
 
     def load(self, modules: Sequence[Any]) -> None:
@@ -160,7 +160,7 @@ class Launcher:
             self._finish([work])
 
     @contextmanager
-    def beside(self, phase: str, start: Callable[[], None]) -> Iterator[None]:
+    def overlap(self, phase: str, start: Callable[[], None]) -> Iterator[None]:
         """What `start` launches is run by whoever is free while the block runs, and done when the block ends.
 
         Its launches must not depend on each other nor on what the block does, nor the other way round. On CUDA they
@@ -183,7 +183,7 @@ class Launcher:
             self._finish(self._open[mark:])
 
     @contextmanager
-    def undisturbed(self) -> Iterator[None]:
+    def uninterruptible(self) -> Iterator[None]:
         """`cancel` does not touch the launches inside: for what must be done entirely or not at all."""
         self._whole = True
         try:
@@ -294,18 +294,18 @@ class Launcher:
         """An uninitialised array on the device."""
         return wp.empty(shape, dtype=dtype, device=self.device)
 
-    def kept(self, name: str, rows: int, dtype: Any) -> Any:
+    def scratch(self, name: str, rows: int, dtype: Any) -> Any:
         """An array of at least `rows`, the same whenever `name` asks again: iterations allocate nothing.
 
         It is uninitialised at first, and later holds what was written to it last.
         """
-        array = self._kept.get(name)
+        array = self._scratch.get(name)
         if array is None or array.shape[0] < rows:
             # Some room, for the number of VPLs differs a little from iteration to iteration.
-            array = self._kept[name] = self.empty(rows + rows // 8, dtype)
+            array = self._scratch[name] = self.empty(rows + rows // 8, dtype)
         return array
 
-    def table(self, name: str, data: npt.NDArray[Any], dtype: Any) -> Any:
+    def cached_upload(self, name: str, data: npt.NDArray[Any], dtype: Any) -> Any:
         """Host data on the device, uploaded only when they differ from what `name` was last."""
         known = self._tables.get(name)
         if known is None or not np.array_equal(known[0], data):
@@ -328,7 +328,7 @@ class Launcher:
         return wp.array(data, dtype=dtype, device=self.device)
 
 
-def carve(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
+def partition(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
     """Arrays of so many rows of each type, one after the other in a block of float32: memory that is used twice."""
     arrays, begin = [], 0
     for dtype in dtypes:
@@ -338,7 +338,7 @@ def carve(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
     return arrays
 
 
-def copied(record: Any) -> Any:
+def copy_record(record: Any) -> Any:
     """Another `wp.struct` of the same kind and the same arrays."""
     kind = record._cls
     copy = kind()

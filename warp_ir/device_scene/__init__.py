@@ -5,7 +5,7 @@
 
 from warp_ir.device_scene.camera_data import CameraData, camera_data
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.scene_data import INSTANCE_COLOR, TRIANGLE_EMITTER, Patterns, SceneData
+from warp_ir.device_scene.scene_data import INSTANCE_COLOR, TRIANGLE_EMITTER, SceneData, SurfaceTextures
 from warp_ir.device_scene.upload import DeviceScene, upload_moments, upload_scene
 
 __all__ = [
@@ -14,8 +14,8 @@ __all__ = [
     "CameraData",
     "DeviceFrame",
     "DeviceScene",
-    "Patterns",
     "SceneData",
+    "SurfaceTextures",
     "camera_data",
     "upload_moments",
     "upload_scene",

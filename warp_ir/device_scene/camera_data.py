@@ -26,7 +26,7 @@ class CameraData:
     first_row: int
     image_columns: int
     image_rows: int
-    shows_lights: int  # 1: analytic lights are visible
+    visible_lights: int  # 1: analytic lights are visible
     origin: wp.vec3
     right: wp.vec3
     up: wp.vec3
@@ -67,7 +67,7 @@ def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) ->
     out = CameraData()
     out.first_column, out.first_row, out.columns, out.rows = settings.pixels()
     out.image_columns, out.image_rows = settings.width, settings.height
-    out.shows_lights = int(settings.visible_lights)
+    out.visible_lights = int(settings.visible_lights)
     with np.errstate(over="ignore"):
         origin = frame.to_device(camera.world_from_camera[:3, 3])
     if not np.isfinite(origin).all():

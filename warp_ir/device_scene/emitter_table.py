@@ -70,7 +70,7 @@ def upload_emitters(
     cdf = np.concatenate([[0.0], np.cumsum(power / power.sum())]) if len(power) else np.array([0.0, 1.0])
     cdf[-1] = 1.0
     data.emitter_cdf = launcher.array(cdf, wp.float32)
-    data.emitter_density = launcher.array(np.diff(cdf) / spread if len(power) else [0.0], wp.float32)
+    data.emitter_pdf_area = launcher.array(np.diff(cdf) / spread if len(power) else [0.0], wp.float32)
     data.emitter_kind = launcher.array(kind.astype(np.int32) if len(kind) else [0], wp.int32)
     data.emitter_item = launcher.array(item.astype(np.int32) if len(item) else [0], wp.int32)
 

@@ -21,7 +21,7 @@ _MOST = 31
 """Meshes that have one, at most: those with most triangles."""
 
 
-def glowing_meshes(scene: Scene) -> set[int]:
+def emissive_meshes(scene: Scene) -> set[int]:
     """The instanced meshes that emit. They are written out: every place of theirs is an emitter of its own."""
     emits = np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
     if not emits.any():
@@ -29,11 +29,11 @@ def glowing_meshes(scene: Scene) -> set[int]:
     return {k for group in scene.instances for k in group.meshes if emits[scene.meshes[k].material].any()}
 
 
-def arranged(scene: Scene) -> tuple[Scene, list[int]]:
+def storage_order(scene: Scene) -> tuple[Scene, list[int]]:
     """The scene as it is stored, meshes of the world before those of prototypes; and the meshes' former numbers."""
     if not scene.instances:
         return scene, list(range(len(scene.meshes)))
-    scene = scene.flat(glowing_meshes(scene))
+    scene = scene.flat(emissive_meshes(scene))
     groups = [g for g in scene.instances if any(len(scene.meshes[k].triangles) for k in g.meshes)]
     below = [k for g in groups for k in g.meshes]
     unseen = {k for g in scene.instances for k in g.meshes} - {*below}
@@ -79,7 +79,7 @@ class Part:
 
 
 @dataclass(eq=False)
-class Moment:
+class StoredSample:
     """A scene, and where its parts are."""
 
     scene: Scene
@@ -125,7 +125,7 @@ class Layout:
         self.head_end = self.point_count, self.triangle_count, self.tree_count
         self.tail: list[Part] = []
         """Those that move."""
-        self.moments: list[Moment] = []
+        self.moments: list[StoredSample] = []
         for (scene, numbers), own in zip(scenes, groups, strict=True):
             rest = {key: meshes for key, meshes in own.items() if key not in set(still)}
             parts = self._moving(rest)
@@ -133,7 +133,7 @@ class Layout:
             seen = [*self.head, *parts]
             place = {part.numbers: part for part in seen if part.half is not None}
             prototypes = [place[key[2]] for key in own if key[0]]
-            self.moments.append(Moment(scene, numbers, [p for p in seen if p.half is None], prototypes))
+            self.moments.append(StoredSample(scene, numbers, [p for p in seen if p.half is None], prototypes))
 
     def _still(self, groups: "_Groups", keys: Sequence["_Key"]) -> list[Part]:
         world = [key for key in keys if not key[0]]

@@ -15,7 +15,7 @@ from warp_ir.device_scene.geometry_storage import Layout, Part
 from warp_ir.device_scene.growing_table import Table
 from warp_ir.device_scene.instance_tables import InstanceTables, upload_instances
 from warp_ir.device_scene.material_tables import LARGEST_UV, upload_materials
-from warp_ir.device_scene.scene_data import INSTANCE_COLOR, Patterns
+from warp_ir.device_scene.scene_data import INSTANCE_COLOR, SurfaceTextures
 from warp_ir.scene import Scene, Texture
 from warp_ir.texture import upload_textures
 
@@ -39,7 +39,7 @@ _PATTERNS = ("triangle_uvs", "corner_uvs", "triangle_tangents", "corner_tangents
 """Those that are for textures."""
 
 
-class Surfaces:
+class DeviceGeometry:
     """The surfaces of a scene's moments on a device; owns what the records refer to by id."""
 
     def __init__(self, launcher: Launcher) -> None:
@@ -62,7 +62,7 @@ class Surfaces:
         """Brings the moments of a scene onto the device, and keeps of what is there all that is the same.
 
         Args:
-            scenes: As `storage.arranged` gives them.
+            scenes: As `storage.storage_order` gives them.
             frame: Of the device.
         """
         uv_sets = list(dict.fromkeys(t.uv for scene, _ in scenes for m in scene.materials for t in m.textures))
@@ -90,10 +90,10 @@ class Surfaces:
         for name in _TYPES:
             if name not in _PATTERNS:
                 setattr(data, name, self._tables[name].array)
-        patterns = upload_materials(here.scene.materials, self._texture_table, data, launcher)
+        surface_textures = upload_materials(here.scene.materials, self._texture_table, data, launcher)
         for name in _PATTERNS:
-            setattr(patterns, name, self._tables[name].array)
-        data.patterns = launcher.array([patterns], Patterns)
+            setattr(surface_textures, name, self._tables[name].array)
+        data.surface_textures = launcher.array([surface_textures], SurfaceTextures)
         data.bvh = self._bvhs[moment]
         roots = [self._trees.root(part.tree) for part in here.prototypes]
         assert self._frame is not None
@@ -105,7 +105,7 @@ class Surfaces:
         both = TwoLevel()
         both.bvh, both.tree = data.bvh, instances.tree
         data.two_level = launcher.array([both], TwoLevel)
-        return self, patterns, instances, both
+        return self, surface_textures, instances, both
 
     def rows(self, moment: int) -> list[int]:
         """Of each mesh of the moment's arranged scene the row of its first triangle; -1: it has none."""

@@ -11,7 +11,7 @@ import warp as wp
 from warp_ir.bvh import Instance, InstanceTree, build_instance_tree
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.geometry_storage import Moment
+from warp_ir.device_scene.geometry_storage import StoredSample
 from warp_ir.scene import InputError, Instances
 from warp_ir.scene.instances import boxes, cofactors
 
@@ -29,7 +29,7 @@ class InstanceTables:
 
 
 def upload_instances(
-    moment: Moment, frame: DeviceFrame, roots: Sequence[int], known: Sequence[InstanceTables], launcher: Launcher
+    moment: StoredSample, frame: DeviceFrame, roots: Sequence[int], known: Sequence[InstanceTables], launcher: Launcher
 ) -> InstanceTables:
     """Instances and the tree over them.
 
@@ -61,7 +61,7 @@ def upload_instances(
 
 
 def _upload(
-    moment: Moment, frame: DeviceFrame, roots: Sequence[int], made_from: Any, launcher: Launcher
+    moment: StoredSample, frame: DeviceFrame, roots: Sequence[int], made_from: Any, launcher: Launcher
 ) -> InstanceTables:
     groups = moment.scene.instances
     if not groups:

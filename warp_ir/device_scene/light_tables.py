@@ -11,14 +11,14 @@ import warp as wp
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.scene_data import LightTables
-from warp_ir.light_modifiers import upload_controls
-from warp_ir.sampling.distribution2d import GridList, cell_measure
+from warp_ir.light_modifiers import upload_light_modifiers
+from warp_ir.sampling.distribution2d import Distribution2DList, cell_measure
 from warp_ir.scene import InputError, Light, LightKind, Scene
 
 
 def upload_lights(
-    scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher, former: Sequence[GridList] = ()
-) -> tuple[Any, GridList, npt.NDArray[np.float64]]:
+    scene: Scene, frame: DeviceFrame, data: Any, launcher: Launcher, former: Sequence[Distribution2DList] = ()
+) -> tuple[Any, Distribution2DList, npt.NDArray[np.float64]]:
     """Fills the light tables.
 
     Args:
@@ -39,10 +39,10 @@ def upload_lights(
     points = np.array([light.kind == LightKind.POINT for light in lights], bool)
     radiance[points] *= frame.scale**2  # intensity is radiance times area
     angle = [1.0 - math.cos(math.radians(0.5 * min(max(light.angle, 0.0), 360.0))) for light in lights]
-    grids = GridList(former)
-    texture, gain = _add_textures(lights, grids)
+    distributions = Distribution2DList(former)
+    texture, gain = _add_textures(lights, distributions)
     tables = LightTables()
-    tables.controls, peak, share = upload_controls(lights, axes, scene.meshes, grids, launcher)
+    tables.modifiers, peak, share = upload_light_modifiers(lights, axes, scene.meshes, distributions, launcher)
     radiance *= peak[:, None]
 
     data.light_count = len(lights)
@@ -53,10 +53,10 @@ def upload_lights(
     data.light_radiance = launcher.array(_rows(radiance), wp.vec3)
     data.light_angle = launcher.array(angle or [0.0], wp.float32)
     tables.texture = launcher.array(texture or [-1], wp.int32)
-    tables.grids = grids.upload(launcher)
+    tables.distributions = distributions.upload(launcher)
     data.textured_count = sum(k >= 0 for k in texture)
-    data.control_count, data.shaped_count = tables.controls.count, tables.controls.shaped_count
-    data.only_sampled_count = tables.controls.sampled_count
+    data.modifier_count, data.shaped_count = tables.modifiers.count, tables.modifiers.shaped_count
+    data.only_sampled_count = tables.modifiers.sampled_count
     data.light_tables = launcher.array([tables], LightTables)
 
     shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
@@ -66,10 +66,12 @@ def upload_lights(
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
     data.shape_bvh = bvh.id
-    return (bvh, tables), grids, gain * share
+    return (bvh, tables), distributions, gain * share
 
 
-def _add_textures(lights: tuple[Light, ...], grids: GridList) -> tuple[list[int], npt.NDArray[np.float64]]:
+def _add_textures(
+    lights: tuple[Light, ...], distributions: Distribution2DList
+) -> tuple[list[int], npt.NDArray[np.float64]]:
     """Adds the lights' textures to the grids; returns each light's grid (-1: none) and what it makes of the power."""
     index, means = [], np.ones(len(lights))
     known: dict[tuple[int, bool], int] = {}  # lights may share an image
@@ -84,7 +86,7 @@ def _add_textures(lights: tuple[Light, ...], grids: GridList) -> tuple[list[int]
         rows = light.texture.mean(axis=1, dtype=np.float64) @ tint / 3.0
         means[k] = float(rows @ measure / measure.sum())
         if key not in known:
-            known[key] = grids.add(light.texture, theta=theta)
+            known[key] = distributions.add(light.texture, theta=theta)
         index.append(known[key])
     return index, means
 

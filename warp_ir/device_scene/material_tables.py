@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.scene_data import Patterns
+from warp_ir.device_scene.scene_data import SurfaceTextures
 from warp_ir.scene import Material, Texture
 
 LARGEST_UV = 1.0e6
@@ -16,7 +16,7 @@ LARGEST_UV = 1.0e6
 def upload_materials(
     materials: tuple[Material, ...], texture_table: Callable[[list[Texture]], Any], data: Any, launcher: Launcher
 ) -> Any:
-    """Fills the tables of materials; returns the `Patterns`, in which the texture coordinates are still missing.
+    """Fills the tables of materials; returns the `SurfaceTextures`, in which the texture coordinates are still missing.
 
     Args:
         materials: Of the scene.
@@ -34,14 +34,14 @@ def upload_materials(
     data.albedo_texture = launcher.array([row[m.albedo_texture] for m in materials], wp.int32)
     data.emission_texture = launcher.array([row[m.emission_texture] for m in materials], wp.int32)
     data.opacity_texture = launcher.array([row[m.opacity_texture] for m in materials], wp.int32)
-    data.open_count = sum(m.opacity < 1.0 for m in materials)
+    data.non_opaque_count = sum(m.opacity < 1.0 for m in materials)
     data.texture_count = len(textures)
     data.normal_map_count = sum(m.normal_texture is not None for m in materials)
-    patterns = Patterns()
-    patterns.textures = texture_table(textures)
+    surface_textures = SurfaceTextures()
+    surface_textures.textures = texture_table(textures)
     unseen = (-1.0, -1.0, -1.0)
-    patterns.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
-    patterns.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
+    surface_textures.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
+    surface_textures.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
     data.glow_count = sum(m.glow is not None for m in materials)
-    patterns.normal_texture = launcher.array([row[m.normal_texture] for m in materials], wp.int32)
-    return patterns
+    surface_textures.normal_texture = launcher.array([row[m.normal_texture] for m in materials], wp.int32)
+    return surface_textures

@@ -3,8 +3,8 @@
 import warp as wp
 
 from warp_ir.bvh import Bvh, Instance, TwoLevel
-from warp_ir.light_modifiers import ControlTables
-from warp_ir.sampling.distribution2d import GridTables
+from warp_ir.light_modifiers import LightModifierTables
+from warp_ir.sampling.distribution2d import Distribution2DTables
 from warp_ir.scene import LightKind
 from warp_ir.texture import TextureTable
 
@@ -17,7 +17,7 @@ TRIANGLE_EMITTER = len(LightKind)
 
 
 @wp.struct
-class Patterns:
+class SurfaceTextures:
     """The textures, and where they lie; and what the camera sees of some materials."""
 
     textures: TextureTable
@@ -35,8 +35,8 @@ class LightTables:
     """Textures and controls of lights."""
 
     texture: wp.array[wp.int32]  # [lights], the grid that multiplies the radiance, or -1
-    grids: GridTables
-    controls: ControlTables
+    distributions: Distribution2DTables
+    modifiers: LightModifierTables
 
 
 @wp.struct
@@ -69,8 +69,8 @@ class SceneData:
     opacity_texture: wp.array[wp.int32]
     texture_count: int
     normal_map_count: int  # materials with one
-    patterns: wp.array[Patterns]  # one: a pointer is passed where a table would be copied
-    open_count: int  # materials whose opacity is below 1 anywhere
+    surface_textures: wp.array[SurfaceTextures]  # one: a pointer is passed where a table would be copied
+    non_opaque_count: int  # materials whose opacity is below 1 anywhere
     glow_count: int  # materials of which the camera sees something else than their emission
     footprint: float  # width of the patch that a reflection of light stands for
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
@@ -80,7 +80,7 @@ class SceneData:
     emitter_count: int
     emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
-    emitter_density: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
+    emitter_pdf_area: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
     triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no material emits
 
@@ -93,7 +93,7 @@ class SceneData:
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
     light_emitter: wp.array[wp.int32]  # its row in the emitter tables, or -1
     textured_count: int  # lights with a texture
-    control_count: int  # lights, and surfaces, with a control
+    modifier_count: int  # lights, and surfaces, with a control
     shaped_count: int  # of them with a shaping
     only_sampled_count: int  # lights with an area that rays are not to find
     light_tables: wp.array[

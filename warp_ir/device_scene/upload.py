@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ir.device.launcher import Launcher, copied
+from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene.emitter_table import upload_emitters
 from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
-from warp_ir.device_scene.geometry_storage import arranged
-from warp_ir.device_scene.geometry_update import Surfaces, same_objects
+from warp_ir.device_scene.geometry_storage import storage_order
+from warp_ir.device_scene.geometry_update import DeviceGeometry, same_objects
 from warp_ir.device_scene.light_tables import upload_lights
 from warp_ir.device_scene.scene_data import SceneData
 from warp_ir.device_scene.validate import check_scene
 from warp_ir.sampling import sobol
-from warp_ir.sampling.distribution2d import GridList
+from warp_ir.sampling.distribution2d import Distribution2DList
 from warp_ir.scene import InputError, Scene, materials_of
 
 _PATCHES = 2**14
@@ -45,7 +45,7 @@ class DeviceScene:
     """The owners of the surfaces and of the lights: a struct holds only their ids, and a freed id crashes."""
     source: Scene
     """What was uploaded."""
-    surfaces: Surfaces
+    surfaces: DeviceGeometry
     """Shared with other moments; and handed on to what is uploaded next."""
     changes: int
     """Of the surfaces, when this was uploaded."""
@@ -53,7 +53,7 @@ class DeviceScene:
     """`source` as it is arranged in the tables ..."""
     rows: list[int]
     """... and the row of the first triangle of each of its meshes; -1: it has none."""
-    grids: GridList
+    distributions: Distribution2DList
     """The images and the shaping of its lights."""
     bounds: tuple[float, ...]
     """Lower and upper corner of all moments together, in the world."""
@@ -112,21 +112,21 @@ def _upload(
     """Scenes that are not all there; `previous` ones may have parts of them."""
     lower, upper = bounds
     extent = float(np.linalg.norm(upper - lower))
-    stored = [arranged(scene) for scene in scenes]
-    lit: list[tuple[Any, Any, GridList, Any]] = []
-    grids = [other.grids for other in previous]
+    stored = [storage_order(scene) for scene in scenes]
+    lit: list[tuple[Any, Any, Distribution2DList, Any]] = []
+    distributions = [other.distributions for other in previous]
     for k, scene in enumerate(scenes):
         like = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
         if like is not None:
-            lit.append((copied(lit[like][0]), *lit[like][1:]))
+            lit.append((copy_record(lit[like][0]), *lit[like][1:]))
             continue
         data = SceneData()
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
         # Links name meshes by their numbers in the scene, not by where they are stored.
-        lit.append((data, *upload_lights(scene, frame, data, launcher, grids)))
-        grids.append(lit[-1][2])
-    surfaces = previous[0].surfaces if previous else Surfaces(launcher)
+        lit.append((data, *upload_lights(scene, frame, data, launcher, distributions)))
+        distributions.append(lit[-1][2])
+    surfaces = previous[0].surfaces if previous else DeviceGeometry(launcher)
     surfaces.take(stored, frame)
     done: list[DeviceScene] = []
     for k, (scene, (data, shapes, own, gain)) in enumerate(zip(scenes, lit, strict=True)):
@@ -158,7 +158,7 @@ def _upload(
                 changes=surfaces.changes,
                 stored=stored[k][0],
                 rows=rows,
-                grids=own,
+                distributions=own,
                 bounds=(*lower, *upper),
             )
         )

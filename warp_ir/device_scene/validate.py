@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.geometry_storage import glowing_meshes
+from warp_ir.device_scene.geometry_storage import emissive_meshes
 from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000
@@ -29,7 +29,7 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
         if used and not 0 <= used[0] <= used[-1] < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     _check_instances(scene)
-    glowing = glowing_meshes(scene)
+    glowing = emissive_meshes(scene)
     written = [(g, k) for g in scene.instances for k in g.meshes if k in glowing]
     again = [(len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in written]
     triangles, instances = scene.triangle_count + sum(again), sum(len(g.matrices) for g in scene.instances)

@@ -12,7 +12,7 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
 from warp_ir.estimators.keller import Keller
 from warp_ir.estimators.path import PathTracer
-from warp_ir.estimators.vpl import VplGatherer
+from warp_ir.estimators.vpl import VplEstimator
 from warp_ir.settings import RenderSettings
 
 
@@ -29,5 +29,5 @@ class Estimator(Protocol):
         """
 
 
-ESTIMATORS: dict[str, type[Estimator]] = {"vpl": VplGatherer, "keller": Keller, "path": PathTracer}
+ESTIMATORS: dict[str, type[Estimator]] = {"vpl": VplEstimator, "keller": Keller, "path": PathTracer}
 """By the names that `RenderSettings.estimator` takes."""

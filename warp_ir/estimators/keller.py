@@ -20,10 +20,10 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.lights import arriving
+from warp_ir.lights import light_visibility
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import indices, pixel_at
@@ -50,7 +50,7 @@ def geometry_term(
     return at_point * at_vpl / squared
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _accumulate(
     first: int,
     scene: SceneData,
@@ -73,11 +73,11 @@ def _accumulate(
                 position, gbuffer.normal[pixel], gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k]
             )
             if g > 0.0:
-                control = int(-1)
-                if scene.control_count > 0 and k < vpls.on_lights:
-                    control = vpls.control[k]
+                modifiers = int(-1)
+                if scene.modifier_count > 0 and k < vpls.on_lights:
+                    modifiers = vpls.modifiers[k]
                 # V, unless the light is shaped or linked.
-                arrives = arriving(scene, control, position, gbuffer.mesh[pixel], True, vpls.position[k])
+                arrives = light_visibility(scene, modifiers, position, gbuffer.mesh[pixel], True, vpls.position[k])
                 irradiance = wp.cw_mul(vpls.intensity[k], arrives) * wp.min(g, bound)
                 if vpls.bounce[k] == 0:
                     from_lights += irradiance

@@ -12,10 +12,17 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
-from warp_ir.lights import Arrival, arriving, lights_found, power_heuristic, sample_arrival, surface_found
+from warp_ir.lights import (
+    DirectSample,
+    intersect_lights,
+    light_visibility,
+    power_heuristic,
+    sample_direct,
+    surface_emission_mis,
+)
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
@@ -35,24 +42,24 @@ def _reflected(
     shading_normal: wp.vec3,
     mesh: int,
     seen: bool,
-    light: Arrival,
+    light: DirectSample,
 ) -> wp.vec3:
     """Weighted irradiance over π at a point from one sample of the lights."""
     at_point = wp.dot(shading_normal, light.direction)
     if at_point <= 0.0 or wp.max(light.radiance) <= 0.0 or wp.dot(normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    arrives = arriving(scene, light.control, position, mesh, seen, light.target)
+    arrives = light_visibility(scene, light.modifiers, position, mesh, seen, light.target)
     if wp.max(arrives) <= 0.0:
         return wp.vec3(0.0)
     # The two ways to find this light are weighted by their densities; a delta light has only one (density 0).
     by_bsdf = at_point / wp.pi
     weight = float(1.0)
-    if light.density > 0.0:
-        weight = power_heuristic(light.density, by_bsdf)
+    if light.pdf > 0.0:
+        weight = power_heuristic(light.pdf, by_bsdf)
     return wp.cw_mul(light.radiance, arrives) * (weight * by_bsdf)
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_paths(
     first: int,
     scene: SceneData,
@@ -81,7 +88,7 @@ def _trace_paths(
         while wp.max(throughput) > 0.0:
             u = sobol.sample_1d(scene.sobol, 0, dimension, stream)
             u2 = sobol.sample_2d(scene.sobol, 0, dimension + 1, stream)
-            light = sample_arrival(scene, position, u, u2)
+            light = sample_direct(scene, position, u, u2)
             lit = _reflected(scene, position, normal, shading_normal, mesh, bounce == 0, light)
             found = wp.cw_mul(throughput, lit)
 
@@ -89,13 +96,13 @@ def _trace_paths(
             u2 = sobol.sample_2d(scene.sobol, 0, dimension + 3, stream)
             direction = square_to_cosine_hemisphere(u2, shading_normal)
             above = wp.dot(direction, normal) > 0.0
-            density = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
+            pdf = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
             hit = closest(scene, position, direction, 3.0e38)
             if above:
                 reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
-                seen = lights_found(scene, position, direction, reach, hit.triangle < 0, density, mesh)
+                seen = intersect_lights(scene, position, direction, reach, hit.triangle < 0, pdf, mesh)
                 if hit.triangle >= 0:
-                    seen += surface_found(scene, hit, direction, density, mesh)
+                    seen += surface_emission_mis(scene, hit, direction, pdf, mesh)
                 found += wp.cw_mul(throughput, seen)
             if bounce == 0:
                 once += found

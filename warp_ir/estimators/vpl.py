@@ -9,7 +9,7 @@ The ray is as short as 1/√b, since G ≤ 1/d² cannot exceed b farther away, a
 it meets has gathered in turn, and so on. Emission met on the way is the part that the bound took from the VPLs on
 that light, no more: nothing counts twice.
 
-The bound follows the density of the VPLs (`gather.arrange`): no length in scene units is chosen anywhere.
+The bound follows the density of the VPLs (`gather.build_sets`): no length in scene units is chosen anywhere.
 """
 
 from typing import Any
@@ -17,20 +17,20 @@ from typing import Any
 import warp as wp
 
 import warp_ir.guiding.probes
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.guiding import can_pay, learn
-from warp_ir.lights import cut_share, lights_beyond, surface_beyond
+from warp_ir.guiding import guiding_applies, learn
+from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
 from warp_ir.vpl.emission import emit_vpls
-from warp_ir.vpl.gather import Receiver, gather
+from warp_ir.vpl.gather import ShadingPoint, gather
 from warp_ir.vpl.guide import Guide, unguided
-from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, arrange
+from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, build_sets
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -38,7 +38,7 @@ _SHADOW_RAYS = (4, 4)
 """Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
 _SHADOW_RAYS_AFTER = (2, 2)
 """Where a compensation ray ends: such light has lost most of its weight."""
-_UNGUIDED = 4
+_UNGUIDED_ITERATIONS = 4
 """Iterations before those whose light paths are guided: for a picture of fewer, a pilot would take too long."""
 _ROULETTE_DEPTH = wp.constant(2)
 _INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the light paths
@@ -74,19 +74,17 @@ def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
 
 
 @wp.func
-def _first_receiver(gbuffer: GBuffer, pixel: int) -> Receiver:
-    x = Receiver()
+def _first_receiver(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
+    x = ShadingPoint()
     x.position = gbuffer.position[pixel]
     x.normal = gbuffer.normal[pixel]
     x.shading_normal = gbuffer.shading_normal[pixel]
     x.mesh = gbuffer.mesh[pixel]
-    x.seen = True
+    x.from_camera = True
     return x
 
 
-@wp.kernel(
-    module="warp_ir.vpl.emission", cuda_max_registers=MOST_REGISTERS
-)  # so that rays and lights are compiled once
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # so that rays and lights are compiled once
 def _gather_pixels(
     first: int,
     scene: SceneData,
@@ -130,13 +128,15 @@ def _gather_pixels(
             cosine = wp.dot(direction, x.shading_normal)
             hit = closest(scene, x.position, direction, reach)
             near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = lights_beyond(scene, x.position, direction, near, cosine, bound, reach, x.mesh, x.seen)
+            found = clamped_light_radiance(
+                scene, x.position, direction, near, cosine, bound, reach, x.mesh, x.from_camera
+            )
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-                cut = cut_share(bound.least, g)
+                cut = clamped_fraction(bound.least, g)
                 if cut > 0.0:
-                    found += surface_beyond(scene, hit, direction, g, bound, x.mesh)
+                    found += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
             found = wp.cw_mul(throughput, found) * wp.pi
             if depth == 0:
                 once += found
@@ -154,14 +154,14 @@ def _gather_pixels(
             x.normal = hit.normal
             x.shading_normal = hit.normal
             x.mesh = scene.triangle_mesh[hit.triangle]
-            x.seen = False
+            x.from_camera = False
             rays = settings.rays_after
             depth += 1
     direct[pixel] = once / wp.pi
     indirect[pixel] = more / wp.pi
 
 
-class VplGatherer:
+class VplEstimator:
     """Few shadow rays, resampled; bounded and compensated."""
 
     def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
@@ -169,9 +169,9 @@ class VplGatherer:
         self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
         self._unguided = unguided(scene, launcher)
         self._guide: Guide | None = self._unguided
-        if can_pay(scene):
+        if guiding_applies(scene):
             self._guide = None  # to be learned
-            if settings.iteration_limit > _UNGUIDED:
+            if settings.iteration_limit > _UNGUIDED_ITERATIONS:
                 launcher.load([warp_ir.guiding.probes])
 
     def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
@@ -183,7 +183,7 @@ class VplGatherer:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
 
         guide = self._guide_of(iteration)
-        with launcher.beside("primary", look), launcher.phase("emission"):
+        with launcher.overlap("primary", look), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
                 launcher,
@@ -192,7 +192,7 @@ class VplGatherer:
                 max_bounces=settings.bounce_limit,
                 scramble=scramble,
             )
-            parts = arrange(vpls, guide, launcher)
+            parts = build_sets(vpls, guide, launcher)
         how = GatherSettings()
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
@@ -207,7 +207,7 @@ class VplGatherer:
 
     def _guide_of(self, iteration: int) -> Guide:
         """Where the light paths of an iteration go."""
-        if iteration < _UNGUIDED:
+        if iteration < _UNGUIDED_ITERATIONS:
             return self._unguided
         if self._guide is None:
             with self._launcher.phase("pilot"):

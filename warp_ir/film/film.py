@@ -64,8 +64,8 @@ class Film:
         for name in ("count", "hits", "rejected", "mesh"):
             setattr(data, name, launcher.zeros(pixels, wp.int32))
         self._data = data
-        self._missed: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
-        self.chosen = np.ones(len(self._missed), bool)
+        self._skipped: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
+        self.chosen = np.ones(len(self._skipped), bool)
         """Which tiles of 8 x 8 pixels, row by row, the next iteration is for."""
         self.tiles: Any = all_tiles(width, height, launcher)
         """The same on the device."""
@@ -73,22 +73,22 @@ class Film:
     def choose(self, tiles: npt.NDArray[np.bool_]) -> None:
         """From now on iterations are for these tiles alone, bool [tiles]."""
         self.chosen = tiles
-        self.tiles = some_tiles(tiles, self._missed, self.width, self.height, self._launcher)
+        self.tiles = some_tiles(tiles, self._skipped, self.width, self.height, self._launcher)
 
     @property
     def tile_iterations(self) -> npt.NDArray[np.int32]:
         """How many iterations every tile of 8 x 8 pixels has had, [tiles], row by row."""
-        return self.iterations - self._missed
+        return self.iterations - self._skipped
 
     def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0, moment: int = 0) -> None:
         """Adds one iteration: what the camera saw at some moment, and the irradiance over π estimated for it."""
         add_samples(gbuffer, direct, indirect, exposure, self._data, self._launcher)
         if self.reconstruction is not None:
-            self.reconstruction.observe(gbuffer, direct, indirect, moment)
+            self.reconstruction.accumulate(gbuffer, direct, indirect, moment)
         self.iterations += 1
         if not self.chosen.all():
-            self._missed += ~self.chosen
-            self.tiles.missed = self._launcher.array(self._missed, wp.int32)
+            self._skipped += ~self.chosen
+            self.tiles.skipped = self._launcher.array(self._skipped, wp.int32)
 
     def merge(self, other: "Film") -> None:
         """Adds another film of the same picture; that it used other iterations or another seed is up to you.
@@ -120,7 +120,7 @@ class Film:
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self.iterations += other.iterations
-        self._missed += other._missed
+        self._skipped += other._skipped
         self.choose(self.chosen)
         self.seconds += other.seconds
 
@@ -331,7 +331,7 @@ class Film:
     def _take_tiles(self, chosen: npt.NDArray[np.bool_]) -> None:
         """Finds out how many iterations have left out each tile; chooses those of the next."""
         count = self._data.count.numpy().reshape(self.height, self.width)
-        self._missed = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
+        self._skipped = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
         self.choose(chosen)
 
     def _sum(self, *names: str) -> npt.NDArray[np.float32]:

@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import Launcher, copied
+from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.guiding.probes import Sightings
+from warp_ir.guiding.probes import CameraProbes
 
 Floats = npt.NDArray[np.float64]
 
@@ -20,7 +20,7 @@ WORTH = 1.15
 """Times the variance without, at which learning is worth while."""
 
 
-def choose_emitters(scene: DeviceScene, seen: Sightings, launcher: Launcher) -> DeviceScene | None:
+def learn_emitter_probabilities(scene: DeviceScene, seen: CameraProbes, launcher: Launcher) -> DeviceScene | None:
     """The scene, whose emitters are chosen by what they give; None if that gains little."""
     if scene.data.emitter_count < 2:
         return None
@@ -64,11 +64,11 @@ def _ratio(a: Floats, b: Floats) -> Floats:
 
 def _rechosen(scene: DeviceScene, power: Floats, chosen: Floats, launcher: Launcher) -> DeviceScene:
     """The same scene, its emitters chosen with other probabilities."""
-    data = copied(scene.data)
+    data = copy_record(scene.data)
     cdf = np.concatenate([[0.0], np.cumsum(chosen)])
     cdf /= cdf[-1]
     data.emitter_cdf = launcher.array(cdf, wp.float32)
-    data.emitter_density = launcher.array(scene.data.emitter_density.numpy() * (np.diff(cdf) / power), wp.float32)
+    data.emitter_pdf_area = launcher.array(scene.data.emitter_pdf_area.numpy() * (np.diff(cdf) / power), wp.float32)
     itself = launcher.empty(1, SceneData)
     data.address = wp.uint64(itself.ptr)
     itself.assign(launcher.array([data], SceneData))

@@ -9,8 +9,8 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.guiding.emitter_selection import PRIOR
-from warp_ir.guiding.probes import Connections, clipped
-from warp_ir.vpl.guide import CELLS, LEAST_KEPT, SIDES, Guide, Worth
+from warp_ir.guiding.probes import VplConnections, clamp_outliers
+from warp_ir.vpl.guide import CELLS, MIN_SURVIVAL, SIDES, Guide, VplImportance
 
 Floats = npt.NDArray[np.float64]
 
@@ -26,20 +26,20 @@ _USUAL_DENSITY = 2.0
 
 
 @dataclass(frozen=True)
-class Judgement:
+class VplSurvival:
     """Which VPLs are kept."""
 
     table: Any
-    """The `Worth`."""
+    """The `VplImportance`."""
     kept: float
     """Their share in all."""
     density: float
     """Where they count, over that on all surfaces."""
 
 
-def judge(found: Connections, guide: Guide, launcher: Launcher) -> Judgement | None:
+def learn_survival(found: VplConnections, guide: Guide, launcher: Launcher) -> VplSurvival | None:
     """Which VPLs to keep; None if most of them give about as much."""
-    gives = clipped(found.gives * found.intensity)
+    gives = clamp_outliers(found.gives * found.intensity)
     if not gives.any():
         return None
     cell, intensity = found.cell, found.intensity
@@ -53,16 +53,16 @@ def judge(found: Connections, guide: Guide, launcher: Launcher) -> Judgement | N
     if not much > 0.0:
         return None
     per_intensity = means(cell, intensity, gives)
-    probability = np.clip(per_intensity[cell] * intensity / much, LEAST_KEPT, 1.0)
+    probability = np.clip(per_intensity[cell] * intensity / much, MIN_SURVIVAL, 1.0)
     kept = float(probability.mean())
     if kept > _MOST_KEPT:
         return None
-    table = Worth()
+    table = VplImportance()
     table.known, table.extent = 1, found.extent
     table.per_intensity = launcher.array(per_intensity / much, wp.float32)
     local = _density(found, per_intensity[cell] * intensity, probability)
     everywhere = float(probability.sum()) / guide.scene.area
-    return Judgement(table, kept, max(local / everywhere / _USUAL_DENSITY, 1.0))
+    return VplSurvival(table, kept, max(local / everywhere / _USUAL_DENSITY, 1.0))
 
 
 def means(cell: npt.NDArray[np.int64], intensity: Floats, gives: Floats, levels: int = _LEVELS) -> Floats:
@@ -91,7 +91,7 @@ def larger(cell: npt.NDArray[np.int64], level: int) -> npt.NDArray[np.int64]:
     return np.asarray(((((side << level) + x) << level) + y << level) + z)
 
 
-def _density(found: Connections, gives: Floats, probability: Floats) -> float:
+def _density(found: VplConnections, gives: Floats, probability: Floats) -> float:
     """VPLs kept per area around those that give much, from the smallest cells that hold enough; 0 if none do."""
     for level in range(_LEVELS, 1, -1):
         around = larger(found.cell, level)

@@ -20,10 +20,10 @@ import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.guiding.emitter_selection import choose_emitters
-from warp_ir.guiding.importance import judge
-from warp_ir.guiding.photon_target import aim_at_foci
-from warp_ir.guiding.probes import connect, look
+from warp_ir.guiding.emitter_selection import learn_emitter_probabilities
+from warp_ir.guiding.importance import learn_survival
+from warp_ir.guiding.photon_target import learn_photon_target
+from warp_ir.guiding.probes import connect_vpls, trace_camera_probes
 from warp_ir.scene import LightKind
 from warp_ir.settings import RenderSettings
 from warp_ir.vpl.guide import Guide, unguided
@@ -39,7 +39,7 @@ _PIXELS_PER_PATH = 2
 """Of the image at least, for every light path that is started: so the paths remain cheap next to the gathering."""
 
 
-def can_pay(scene: DeviceScene) -> bool:
+def guiding_applies(scene: DeviceScene) -> bool:
     """Whether there is anything to learn: light from far away, or from places far apart."""
     lights, materials = scene.stored.lights, scene.stored.materials
     if any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in lights):
@@ -71,22 +71,25 @@ def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderS
     paths = min(max(pixels // 16, _FEWEST), _MOST)
     # VPLs are dropped only where more paths can make up for them: else there would be less noise, but in larger spots.
     most = min(pixels // (_PIXELS_PER_PATH * settings.path_count), _MOST_PATHS)
-    chosen = aim = worth = None
+    chosen = photon_target = importance = None
     left = _VPLS_PER_PATH
     if scene.emits:
-        sightings = look(scene, camera, launcher, paths, settings)
+        sightings = trace_camera_probes(scene, camera, launcher, paths, settings)
         if sightings.score.any():
-            chosen, aim = choose_emitters(scene, sightings, launcher), aim_at_foci(scene, sightings, launcher)
-            guide = replace(guide, scene=chosen or scene, aim=aim or guide.aim)
+            chosen, photon_target = (
+                learn_emitter_probabilities(scene, sightings, launcher),
+                learn_photon_target(scene, sightings, launcher),
+            )
+            guide = replace(guide, scene=chosen or scene, photon_target=photon_target or guide.photon_target)
             if most > 1:
-                found = connect(guide, launcher, sightings, paths // 2, settings)
-                worth, left = judge(found, guide, launcher), found.per_path
-    if worth is not None:
-        left *= worth.kept
-        guide = replace(guide, worth=worth.table, density=worth.density)
+                found = connect_vpls(guide, launcher, sightings, paths // 2, settings)
+                importance, left = learn_survival(found, guide, launcher), found.per_path
+    if importance is not None:
+        left *= importance.kept
+        guide = replace(guide, importance=importance.table, density=importance.density)
     if left > 0.0:
         guide = replace(guide, paths=max(min(round(_VPLS_PER_PATH / left), most), 1))
-    decided = {"guided_emitters": chosen, "guided_far_lights": aim, "guided_vpls": worth}
+    decided = {"guided_emitters": chosen, "guided_far_lights": photon_target, "guided_vpls": importance}
     for name, learned in decided.items():
         launcher.profile.counts[name] = int(learned is not None)
     return guide

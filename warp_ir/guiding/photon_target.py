@@ -9,8 +9,8 @@ import warp as wp
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
 from warp_ir.guiding.emitter_selection import BY_POWER, PRIOR, WORTH
-from warp_ir.guiding.probes import Sightings, clipped
-from warp_ir.lights import Aim
+from warp_ir.guiding.probes import CameraProbes, clamp_outliers
+from warp_ir.lights import PhotonTarget
 from warp_ir.scene import LightKind
 
 Floats = npt.NDArray[np.float64]
@@ -25,8 +25,8 @@ _NEAR = 1.0e-3
 """Of the spread of the samples: distances are not told apart below."""
 
 
-def aim_at_foci(scene: DeviceScene, seen: Sightings, launcher: Launcher) -> Any | None:
-    """The `Aim` of distant lights and domes by what of their light the picture reflects; None: not worth it."""
+def learn_photon_target(scene: DeviceScene, seen: CameraProbes, launcher: Launcher) -> Any | None:
+    """The `PhotonTarget` of distant lights and domes, learned from camera probes; None if the gain is small."""
     data = scene.data
     centre, radius = np.array(data.centre, np.float64), float(data.radius)
     rows = max(data.light_count, 1)
@@ -51,16 +51,16 @@ def aim_at_foci(scene: DeviceScene, seen: Sightings, launcher: Launcher) -> Any 
         cdf[item[emitter]] = np.cumsum(_shares(ring, score))
     if before <= WORTH * after:
         return None
-    aim = Aim()
-    aim.rings = _RINGS
-    aim.focus = launcher.array(focus, wp.vec4)
-    aim.cdf = launcher.array(np.pad(cdf / cdf[:, -1:], ((0, 0), (1, 0))).reshape(-1), wp.float32)
-    return aim
+    photon_target = PhotonTarget()
+    photon_target.rings = _RINGS
+    photon_target.focus = launcher.array(focus, wp.vec4)
+    photon_target.cdf = launcher.array(np.pad(cdf / cdf[:, -1:], ((0, 0), (1, 0))).reshape(-1), wp.float32)
+    return photon_target
 
 
 def _shares(ring: npt.NDArray[np.int64], score: Floats) -> Floats:
     """Probabilities of the rings."""
-    sums = np.bincount(ring, clipped(score), _RINGS)
+    sums = np.bincount(ring, clamp_outliers(score), _RINGS)
     total = sums.sum()
     if not total > 0.0:
         return _EVERYWHERE

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher, copied
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher, copy_record
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
-from warp_ir.lights import arriving, choose_emitter, sample_arrival
+from warp_ir.lights import light_visibility, sample_direct, select_emitter
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import RenderSettings
@@ -56,8 +56,8 @@ class _Rows:
     weight: wp.array[wp.float32]  # what irradiance here gives to the pixel
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
-def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, found: _Rows) -> None:
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, found: _Rows) -> None:
     """Follows camera path `i` from what the camera sees on."""
     i = first + wp.tid()
     for row in range(i * _ROWS, (i + 1) * _ROWS):
@@ -77,15 +77,15 @@ def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, f
             number = i * _ASKED_COUNT + j
             pick = sobol.sample_1d(scene.sobol, number, dimension, scramble)
             u = sobol.sample_2d(scene.sobol, number, dimension + 1, scramble)
-            light = sample_arrival(scene, position, pick, u)
-            found.emitter[row] = choose_emitter(scene, pick).emitter
+            light = sample_direct(scene, position, pick, u)
+            found.emitter[row] = select_emitter(scene, pick).emitter
             found.position[row] = position
             found.normal[row] = shading_normal
             found.target[row] = light.target
             found.weight[row] = (throughput[0] + throughput[1] + throughput[2]) * (1.0 / 3.0)
             cosine = wp.dot(shading_normal, light.direction)
             if cosine > 0.0 and wp.dot(normal, light.direction) > 0.0 and wp.max(light.radiance) > 0.0:
-                arrives = arriving(scene, light.control, position, mesh, k == 0, light.target)
+                arrives = light_visibility(scene, light.modifiers, position, mesh, k == 0, light.target)
                 gives = wp.cw_mul(throughput, wp.cw_mul(light.radiance, arrives)) * (cosine / wp.pi)
                 found.score[row] = (gives[0] + gives[1] + gives[2]) * (1.0 / 3.0)
 
@@ -107,7 +107,7 @@ def _look(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, f
 
 
 @dataclass(frozen=True)
-class Sightings:
+class CameraProbes:
     """The vertices of the camera paths, without those that were not there."""
 
     even: npt.NDArray[np.bool_]
@@ -126,14 +126,16 @@ class Sightings:
     """All of it on the device, and the weights in units of brightness."""
 
 
-def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: RenderSettings) -> Sightings:
+def trace_camera_probes(
+    scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: RenderSettings
+) -> CameraProbes:
     """Sends about so many paths from all over the image."""
-    whole = copied(camera)
+    whole = copy_record(camera)
     # As many pixels as there are paths, and nothing but surfaces.
     whole.rows = min(max(round(math.sqrt(paths * camera.image_rows / camera.image_columns)), 1), paths)
     whole.columns = paths // whole.rows
     whole.image_columns, whole.image_rows, whole.first_column, whole.first_row = whole.columns, whole.rows, 0, 0
-    whole.shows_lights = 0
+    whole.visible_lights = 0
     paths = whole.columns * whole.rows
     scramble = sobol.iteration_scramble(settings.seed, _CAMERA_PATHS)
     gbuffer, *_ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
@@ -143,7 +145,7 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
     for name, dtype in (("emitter", wp.int32), ("score", wp.float32), ("position", wp.vec3), ("normal", wp.vec3)):
         setattr(rows, name, launcher.empty(n, dtype))
     rows.target, rows.weight = launcher.empty(n, wp.vec4), launcher.empty(n, wp.float32)
-    launcher.launch(_look, paths, [scene.data, gbuffer, wp.uint32(scramble), rows])
+    launcher.launch(_trace_camera_probes, paths, [scene.data, gbuffer, wp.uint32(scramble), rows])
 
     emitter, score = rows.emitter.numpy(), _finite(rows.score.numpy())
     bounce = np.arange(n) // _ASKED % _VERTICES
@@ -157,18 +159,18 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settin
     if scale.any():
         score /= scale
         rows.weight = launcher.array(rows.weight.numpy() / scale, wp.float32)
-    return Sightings(
+    return CameraProbes(
         even=(np.arange(n) // (_VERTICES * _ASKED) % 2 == 0)[there],
         bounce=bounce[there],
         emitter=emitter[there].astype(np.int64),
-        score=clipped(score[there]),
+        score=clamp_outliers(score[there]),
         position=rows.position.numpy()[there].astype(np.float64),
         target=rows.target.numpy()[there].astype(np.float64),
         rows=rows,
     )
 
 
-def clipped(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def clamp_outliers(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Values of which none decides alone."""
     return np.minimum(values, _MOST * values.mean()) if len(values) else values
 
@@ -177,8 +179,8 @@ def _finite(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     return np.where(np.isfinite(values), values, np.float32(0.0)).astype(np.float64)
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
-def _connect(
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+def _connect_vpls(
     first: int,
     scene: SceneData,
     seen: _Rows,
@@ -212,7 +214,7 @@ def _connect(
 
 
 @dataclass(frozen=True)
-class Connections:
+class VplConnections:
     """VPLs on surfaces, and what they give to the picture."""
 
     cell: npt.NDArray[np.int64]
@@ -227,7 +229,9 @@ class Connections:
     """Edge of the cube that the cells divide, in the device frame."""
 
 
-def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, settings: RenderSettings) -> Connections:
+def connect_vpls(
+    guide: Guide, launcher: Launcher, seen: CameraProbes, paths: int, settings: RenderSettings
+) -> VplConnections:
     """Traces light paths and connects their VPLs with what the camera sees, if the light gets there."""
     scene = guide.scene
     vpls = emit_vpls(
@@ -244,8 +248,8 @@ def connect(guide: Guide, launcher: Launcher, seen: Sightings, paths: int, setti
     cells, gives = launcher.empty(max(n, 1), wp.int32), launcher.empty(max(n, 1) * _CONNECTIONS, wp.float32)
     chosen = vpls.on_lights + np.arange(n) * on_surfaces // max(n, 1)
     rows = launcher.array(chosen, wp.int32)
-    launcher.launch(_connect, n, [scene.data, seen.rows, vpls, rows, extent, cells, gives])
-    return Connections(
+    launcher.launch(_connect_vpls, n, [scene.data, seen.rows, vpls, rows, extent, cells, gives])
+    return VplConnections(
         cell=cells.numpy()[:n].astype(np.int64),
         intensity=_finite(vpls.intensity.numpy()[chosen]).sum(axis=1),
         gives=_finite(gives.numpy()[: n * _CONNECTIONS]).reshape(n, _CONNECTIONS).mean(axis=1),

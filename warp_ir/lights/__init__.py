@@ -1,32 +1,38 @@
 """Emitters: points on them, photons from them, rays that find them. Emissive triangles and UsdLux lights are one list.
 
-`shape.py` is one light, `arriving.py` what of it gets to a point.
+`shape.py` is one light, `light_visibility.py` what of it gets to a point.
 """
 
-from warp_ir.lights.bias_compensation import Bound, bound_on, cut_share, lights_beyond, surface_beyond
-from warp_ir.lights.emit_photon import Aim, emit, land
-from warp_ir.lights.intersect import lights_found, surface_found, surface_seen
-from warp_ir.lights.sample_area import LightPoint, choose_emitter, sample_light
-from warp_ir.lights.sample_direct import Arrival, power_heuristic, sample_arrival
-from warp_ir.lights.visibility import arriving
+from warp_ir.lights.bias_compensation import (
+    Bound,
+    bound_for_pdf,
+    clamped_fraction,
+    clamped_light_radiance,
+    clamped_surface_radiance,
+)
+from warp_ir.lights.emit_photon import PhotonTarget, emit_photon, first_reflection
+from warp_ir.lights.intersect import emission_to_camera, intersect_lights, surface_emission_mis
+from warp_ir.lights.sample_area import EmitterSample, sample_light, select_emitter
+from warp_ir.lights.sample_direct import DirectSample, power_heuristic, sample_direct
+from warp_ir.lights.visibility import light_visibility
 
 __all__ = [
-    "Aim",
-    "Arrival",
     "Bound",
-    "LightPoint",
-    "arriving",
-    "bound_on",
-    "choose_emitter",
-    "cut_share",
-    "emit",
-    "land",
-    "lights_beyond",
-    "lights_found",
+    "DirectSample",
+    "EmitterSample",
+    "PhotonTarget",
+    "bound_for_pdf",
+    "clamped_fraction",
+    "clamped_light_radiance",
+    "clamped_surface_radiance",
+    "emission_to_camera",
+    "emit_photon",
+    "first_reflection",
+    "intersect_lights",
+    "light_visibility",
     "power_heuristic",
-    "sample_arrival",
+    "sample_direct",
     "sample_light",
-    "surface_beyond",
-    "surface_found",
-    "surface_seen",
+    "select_emitter",
+    "surface_emission_mis",
 ]

@@ -3,9 +3,9 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.light_modifiers import linked, shaping_factor
-from warp_ir.lights.sample_area import LightPoint
-from warp_ir.lights.visibility import CROSSINGS, behind
+from warp_ir.light_modifiers import in_link_set, shaping_factor
+from warp_ir.lights.sample_area import EmitterSample
+from warp_ir.lights.visibility import CROSSINGS, continue_behind
 from warp_ir.sampling.distribution2d import cell_direction, sample_cell
 from warp_ir.sampling.square_to import from_local, square_to_cone, square_to_cosine_hemisphere, square_to_disk
 from warp_ir.surface import Hit, closest, scene_at
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Emission:
+class Photon:
     """A photon that leaves a light."""
 
     origin: wp.vec3
@@ -23,7 +23,7 @@ class Emission:
 
 
 @wp.struct
-class Aim:
+class PhotonTarget:
     """Where photons from far away go: more of them pass close by a focus, if there is one.
 
     Seen from the light, rings lie around the focus; each is half as wide as the next and has a probability of its own.
@@ -35,20 +35,20 @@ class Aim:
 
 
 @wp.func
-def emit(scene: SceneData, point: LightPoint, aim: Aim, u: wp.vec2, v: wp.vec2) -> Emission:
+def emit_photon(scene: SceneData, point: EmitterSample, photon_target: PhotonTarget, u: wp.vec2, v: wp.vec2) -> Photon:
     """A photon from a point on an emitter: `u` gives its direction, `v` the place of one from far away."""
-    out = Emission()
+    out = Photon()
     xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
     if point.position[3] == 0.0:
         # Parallel light enters through a disk that covers the scene, seen from there.
         out.direction = -xyz
-        if aim.rings == 0:
+        if photon_target.rings == 0:
             d = square_to_disk(v)
             out.origin = scene.centre + scene.radius * (from_local(wp.vec3(d[0], d[1], 0.0), xyz) + xyz)
             out.flux = point.intensity * (wp.pi * scene.radius * scene.radius)
         else:
-            entry = _aimed(aim, scene.emitter_item[point.emitter], v)
-            focus = aim.focus[scene.emitter_item[point.emitter]]
+            entry = _sample_target(photon_target, scene.emitter_item[point.emitter], v)
+            focus = photon_target.focus[scene.emitter_item[point.emitter]]
             away = from_local(wp.vec3(entry[0], entry[1], 0.0), xyz)
             out.origin = wp.vec3(focus[0], focus[1], focus[2]) + away
             out.origin += (scene.radius - wp.dot(out.origin - scene.centre, xyz)) * xyz
@@ -61,22 +61,22 @@ def emit(scene: SceneData, point: LightPoint, aim: Aim, u: wp.vec2, v: wp.vec2) 
         out.origin = xyz
         out.direction = square_to_cosine_hemisphere(u, wp.vec3(point.normal[0], point.normal[1], point.normal[2]))
         out.flux = point.intensity * wp.pi
-    if point.control >= 0:
-        out = _shaped(scene.address, point, u, out)
+    if point.modifiers >= 0:
+        out = _shape_photon(scene.address, point, u, out)
     return out
 
 
 @wp.func
-def _aimed(aim: Aim, light: int, v: wp.vec2) -> wp.vec3:
+def _sample_target(photon_target: PhotonTarget, light: int, v: wp.vec2) -> wp.vec3:
     """Where a photon passes the focus, in the plane across its way, and the area over the probability of the ring."""
-    begin = light * (aim.rings + 1)
+    begin = light * (photon_target.rings + 1)
     ring = int(0)
-    while ring < aim.rings - 1 and aim.cdf[begin + ring + 1] <= v[0]:
+    while ring < photon_target.rings - 1 and photon_target.cdf[begin + ring + 1] <= v[0]:
         ring += 1
-    probability = aim.cdf[begin + ring + 1] - aim.cdf[begin + ring]
-    outer = aim.focus[light][3] / float(1 << (aim.rings - 1 - ring))
+    probability = photon_target.cdf[begin + ring + 1] - photon_target.cdf[begin + ring]
+    outer = photon_target.focus[light][3] / float(1 << (photon_target.rings - 1 - ring))
     inner = wp.where(ring == 0, 0.0, 0.5 * outer)
-    rest = (v[0] - aim.cdf[begin + ring]) / probability
+    rest = (v[0] - photon_target.cdf[begin + ring]) / probability
     r = wp.sqrt(inner * inner + rest * (outer * outer - inner * inner))
     phi = 2.0 * wp.pi * v[1]
     area = wp.pi * (outer * outer - inner * inner)
@@ -84,25 +84,29 @@ def _aimed(aim: Aim, light: int, v: wp.vec2) -> wp.vec3:
 
 
 @wp.func(inline=False)
-def _shaped(address: wp.uint64, point: LightPoint, u: wp.vec2, unshaped: Emission) -> Emission:
+def _shape_photon(address: wp.uint64, point: EmitterSample, u: wp.vec2, unshaped: Photon) -> Photon:
     """The photon of a light with a control: in a direction that suits the shaping, or with the factor as a weight."""
     scene = scene_at(address)[0]
-    control = scene.light_tables[0].controls.rows[point.control]
+    modifiers = scene.light_tables[0].modifiers.rows[point.modifiers]
     photon = unshaped
-    if control.photons >= 0:
+    if modifiers.photons >= 0:
         local = cell_direction(
-            scene.light_tables[0].grids, control.photons, sample_cell(scene.light_tables[0].grids, control.photons, u)
+            scene.light_tables[0].distributions,
+            modifiers.photons,
+            sample_cell(scene.light_tables[0].distributions, modifiers.photons, u),
         )
-        photon.direction = wp.transpose(control.frame) * wp.vec3(local[0], local[1], local[2])
+        photon.direction = wp.transpose(modifiers.frame) * wp.vec3(local[0], local[1], local[2])
         n = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
         cosine = wp.max(0.0, point.normal[3] + wp.dot(n, photon.direction))
         photon.flux = point.intensity * (cosine / local[3])
-    photon.flux = wp.cw_mul(photon.flux, shaping_factor(control, scene.light_tables[0].grids, photon.direction))
+    photon.flux = wp.cw_mul(
+        photon.flux, shaping_factor(modifiers, scene.light_tables[0].distributions, photon.direction)
+    )
     return photon
 
 
 @wp.struct
-class Landing:
+class PhotonHit:
     """Where a photon is reflected first."""
 
     hit: Hit
@@ -110,28 +114,28 @@ class Landing:
 
 
 @wp.func
-def land(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+def first_reflection(scene: SceneData, row: int, first: Hit, direction: wp.vec3, u: float) -> PhotonHit:
     """The surface that reflects a photon, whose light may pass through some meshes and not light others.
 
     Meshes it passes through are lit all the same, if they are linked: a coin decides, and doubles the flux.
     """
-    return _land(scene.address, row, first, direction, u)
+    return _first_reflection(scene.address, row, first, direction, u)
 
 
 @wp.func(inline=False)
-def _land(address: wp.uint64, row: int, first: Hit, direction: wp.vec3, u: float) -> Landing:
+def _first_reflection(address: wp.uint64, row: int, first: Hit, direction: wp.vec3, u: float) -> PhotonHit:
     scene = scene_at(address)[0]
-    out = Landing()
+    out = PhotonHit()
     out.weight = 1.0
     out.hit = first
-    control = scene.light_tables[0].controls.rows[row]
+    modifiers = scene.light_tables[0].modifiers.rows[row]
     coin = u
     for _ in range(CROSSINGS):
         if out.hit.triangle < 0:
             return out
         mesh = scene.triangle_mesh[out.hit.triangle]
-        lit = not linked(scene.light_tables[0].controls, control.unlit, mesh)
-        if not linked(scene.light_tables[0].controls, control.shadowless, mesh):
+        lit = not in_link_set(scene.light_tables[0].modifiers, modifiers.unlit, mesh)
+        if not in_link_set(scene.light_tables[0].modifiers, modifiers.shadowless, mesh):
             if not lit:
                 out.weight = 0.0
             return out
@@ -141,6 +145,6 @@ def _land(address: wp.uint64, row: int, first: Hit, direction: wp.vec3, u: float
             if coin < 1.0:
                 return out
             coin -= 1.0
-        out.hit = closest(scene, behind(scene, out.hit, direction), direction, 3.0e38)
+        out.hit = closest(scene, continue_behind(scene, out.hit, direction), direction, 3.0e38)
     out.weight = 0.0
     return out

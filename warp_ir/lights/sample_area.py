@@ -10,19 +10,19 @@ import warp as wp
 from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
 from warp_ir.lights.shape import (
     area_scale,
-    control_of,
-    control_of_surface,
-    lift,
     light_axis,
+    modifiers_of,
+    modifiers_of_surface,
+    offset_from_light,
     texture_of,
     unit_area,
     world_from_dome,
 )
 from warp_ir.lights.visibility import only_sampled
-from warp_ir.sampling.distribution2d import cell_direction, cell_place, sample_cell, value_along, value_at_place
+from warp_ir.sampling.distribution2d import cell_direction, cell_uv, sample_cell, value_along, value_at_uv
 from warp_ir.sampling.square_to import square_to_cone, square_to_disk
 from warp_ir.scene import LightKind
-from warp_ir.surface import emitted, offset, presence, scene_at
+from warp_ir.surface import alpha_at, emitted, offset, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,15 +35,15 @@ _TRIANGLE = wp.constant(TRIANGLE_EMITTER)
 
 
 @wp.struct
-class LightPoint:
+class EmitterSample:
     """A random point on a random emitter."""
 
     position: wp.vec4
     normal: wp.vec4
     intensity: wp.vec3  # radiance / density: W/sr for a place, W/m² for a direction
-    density: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
+    pdf: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
     emitter: int
-    control: int  # row of its `LightControl`; -1: it has none
+    modifiers: int  # row of its `LightModifiers`; -1: it has none
 
 
 @wp.struct
@@ -56,7 +56,7 @@ class Choice:
 
 
 @wp.func
-def choose_emitter(scene: SceneData, u: float) -> Choice:
+def select_emitter(scene: SceneData, u: float) -> Choice:
     """An emitter in proportion to power."""
     low = int(0)
     high = scene.emitter_count
@@ -74,11 +74,11 @@ def choose_emitter(scene: SceneData, u: float) -> Choice:
 
 
 @wp.func
-def sample_emitter(scene: SceneData, choice: Choice, u: wp.vec2) -> LightPoint:
+def sample_emitter_area(scene: SceneData, choice: Choice, u: wp.vec2) -> EmitterSample:
     """A point on an emitter, uniformly."""
     item = scene.emitter_item[choice.emitter]
     kind = scene.emitter_kind[choice.emitter]
-    out = LightPoint()
+    out = EmitterSample()
     if kind == _TRIANGLE:
         out = _sample_triangle(scene, item, choice.probability, choice.rest, u)
     elif kind <= _CYLINDER:
@@ -86,26 +86,26 @@ def sample_emitter(scene: SceneData, choice: Choice, u: wp.vec2) -> LightPoint:
     else:
         out = _sample_point_or_direction(scene, item, choice.probability, u)
     out.emitter = choice.emitter
-    if only_sampled(scene, out.control):
-        out.density = 0.0
+    if only_sampled(scene, out.modifiers):
+        out.pdf = 0.0
     return out
 
 
 @wp.func
-def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> LightPoint:
+def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> EmitterSample:
     """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
     return _sample_light(scene.address, u_pick, u)
 
 
 @wp.func(inline=False)
-def _sample_light(address: wp.uint64, u_pick: float, u: wp.vec2) -> LightPoint:
+def _sample_light(address: wp.uint64, u_pick: float, u: wp.vec2) -> EmitterSample:
     scene = scene_at(address)[0]
-    choice = choose_emitter(scene, u_pick)
-    return sample_emitter(scene, choice, u)
+    choice = select_emitter(scene, u_pick)
+    return sample_emitter_area(scene, choice, u)
 
 
 @wp.func
-def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: float, u: wp.vec2) -> LightPoint:
+def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: float, u: wp.vec2) -> EmitterSample:
     a = scene.points[scene.indices[3 * triangle]]
     b = scene.points[scene.indices[3 * triangle + 1]]
     c = scene.points[scene.indices[3 * triangle + 2]]
@@ -120,20 +120,20 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
     at_b = root * (1.0 - u[1])
     p = offset(a, b, c, at_a, at_b, n)
     area = 0.5 * wp.length(cross)
-    out = LightPoint()
-    out.density = probability / (area * sides)
+    out = EmitterSample()
+    out.pdf = probability / (area * sides)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
     radiance = emitted(scene, triangle, at_a, at_b, area, scene.footprint)
-    if scene.open_count > 0:
-        radiance = radiance * presence(scene, triangle, at_a, at_b)
-    out.intensity = radiance / out.density
-    out.control = control_of_surface(scene, triangle)
+    if scene.non_opaque_count > 0:
+        radiance = radiance * alpha_at(scene, triangle, at_a, at_b)
+    out.intensity = radiance / out.pdf
+    out.modifiers = modifiers_of_surface(scene, triangle)
     return out
 
 
 @wp.func
-def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) -> LightPoint:
+def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) -> EmitterSample:
     kind = scene.light_kind[light]
     n = wp.vec3(0.0, 0.0, 1.0)
     q = wp.vec3(u[0] - 0.5, u[1] - 0.5, 0.0)
@@ -141,11 +141,11 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     relative = float(1.0)
     texture = texture_of(scene, light)
     if texture >= 0:
-        cell = sample_cell(scene.light_tables[0].grids, texture, u)
-        place = cell_place(scene.light_tables[0].grids, texture, cell)
-        grid = scene.light_tables[0].grids.grids[texture]
+        cell = sample_cell(scene.light_tables[0].distributions, texture, u)
+        place = cell_uv(scene.light_tables[0].distributions, texture, cell)
+        grid = scene.light_tables[0].distributions.distributions[texture]
         relative = cell.probability * float(grid.rows) * float(grid.columns)
-        radiance = wp.cw_mul(radiance, value_at_place(scene.light_tables[0].grids, texture, place))
+        radiance = wp.cw_mul(radiance, value_at_uv(scene.light_tables[0].distributions, texture, place))
         q = wp.vec3(0.5 - place[0], 0.5 - place[1], 0.0)
     if kind == _DISK:
         d = square_to_disk(u)
@@ -159,21 +159,21 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
         q = wp.vec3(u[0] - 0.5, n[1], n[2])
     p = scene.light_origin[light] + scene.light_axes[light] * q
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
-    out = LightPoint()
-    out.density = probability * relative / (unit_area(kind) * area_scale(scene, light, n))
-    p = lift(p, world_n)
+    out = EmitterSample()
+    out.pdf = probability * relative / (unit_area(kind) * area_scale(scene, light, n))
+    p = offset_from_light(p, world_n)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
-    out.intensity = radiance / out.density
-    out.control = control_of(scene, light)
+    out.intensity = radiance / out.pdf
+    out.modifiers = modifiers_of(scene, light)
     return out
 
 
 @wp.func
-def _sample_point_or_direction(scene: SceneData, light: int, probability: float, u: wp.vec2) -> LightPoint:
+def _sample_point_or_direction(scene: SceneData, light: int, probability: float, u: wp.vec2) -> EmitterSample:
     kind = scene.light_kind[light]
-    out = LightPoint()
-    out.control = control_of(scene, light)
+    out = EmitterSample()
+    out.modifiers = modifiers_of(scene, light)
     out.normal = wp.vec4(0.0, 0.0, 0.0, 1.0)
     if kind == _POINT:
         p = scene.light_origin[light]
@@ -182,14 +182,16 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
         return out
     texture = texture_of(scene, light)
     if texture >= 0:
-        cell = sample_cell(scene.light_tables[0].grids, texture, u)
-        local = cell_direction(scene.light_tables[0].grids, texture, cell)
+        cell = sample_cell(scene.light_tables[0].distributions, texture, u)
+        local = cell_direction(scene.light_tables[0].distributions, texture, cell)
         xyz = wp.vec3(local[0], local[1], local[2])
         d = world_from_dome(scene, light, xyz)
         out.position = wp.vec4(d[0], d[1], d[2], 0.0)
-        out.density = probability * local[3]
-        radiance = wp.cw_mul(scene.light_radiance[light], value_along(scene.light_tables[0].grids, texture, xyz))
-        out.intensity = radiance / out.density
+        out.pdf = probability * local[3]
+        radiance = wp.cw_mul(
+            scene.light_radiance[light], value_along(scene.light_tables[0].distributions, texture, xyz)
+        )
+        out.intensity = radiance / out.pdf
         return out
     cone = float(2.0)
     if kind == _DISTANT:
@@ -197,8 +199,8 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
     d = square_to_cone(u, cone, light_axis(scene, light))
     out.position = wp.vec4(d[0], d[1], d[2], 0.0)
     if cone > 0.0:
-        out.density = probability / (2.0 * wp.pi * cone)
-        out.intensity = scene.light_radiance[light] / out.density
+        out.pdf = probability / (2.0 * wp.pi * cone)
+        out.intensity = scene.light_radiance[light] / out.pdf
     else:
         out.intensity = scene.light_radiance[light] / probability
     return out

@@ -3,11 +3,19 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.lights.sample_area import choose_emitter, sample_emitter
-from warp_ir.lights.shape import area_scale, control_of, lift, light_axis, texture_of, texture_place, unit_area
+from warp_ir.lights.sample_area import sample_emitter_area, select_emitter
+from warp_ir.lights.shape import (
+    area_scale,
+    light_axis,
+    modifiers_of,
+    offset_from_light,
+    texture_of,
+    texture_uv,
+    unit_area,
+)
 from warp_ir.lights.visibility import only_sampled
-from warp_ir.sampling.distribution2d import place_density
-from warp_ir.sampling.solid_angle import aim_at, aim_density
+from warp_ir.sampling.distribution2d import uv_pdf
+from warp_ir.sampling.solid_angle import sample_solid_angle, solid_angle_pdf
 from warp_ir.scene import LightKind
 from warp_ir.surface import Hit
 
@@ -18,45 +26,45 @@ _CYLINDER = wp.constant(int(LightKind.CYLINDER))
 
 
 @wp.struct
-class Arrival:
+class DirectSample:
     """Light that comes to a point from a random direction."""
 
     direction: wp.vec3  # unit, towards the light
     target: wp.vec4  # the place on the light, homogeneous
     radiance: wp.vec3  # over the density of the direction: an estimate of ∫ L dω, unshadowed and unshaped
-    density: float  # of the direction, per solid angle; 0: no ray finds the light, only `sample_arrival`
-    control: int  # row of the light's `LightControl`; -1: it has none
+    pdf: float  # of the direction, per solid angle; 0: no ray finds the light, only `sample_direct`
+    modifiers: int  # row of the light's `LightModifiers`; -1: it has none
 
 
 @wp.func
-def sample_arrival(scene: SceneData, position: wp.vec3, u_pick: float, u: wp.vec2) -> Arrival:
+def sample_direct(scene: SceneData, position: wp.vec3, u_pick: float, u: wp.vec2) -> DirectSample:
     """Light that may come to a point: from which emitter, in proportion to power; if it is a shape, by solid angle."""
-    choice = choose_emitter(scene, u_pick)
+    choice = select_emitter(scene, u_pick)
     item = scene.emitter_item[choice.emitter]
-    out = Arrival()
+    out = DirectSample()
     if scene.emitter_kind[choice.emitter] <= _CYLINDER and texture_of(scene, item) < 0:
-        aim = aim_at(
+        aim = sample_solid_angle(
             scene.light_kind[item],
             scene.light_axes[item],
             scene.light_inverse[item],
             scene.light_origin[item] - position,
             u,
         )
-        if not aim.density > 0.0:
+        if not aim.pdf > 0.0:
             return out
         out.direction = wp.normalize(aim.way)
         off = -out.direction
         if scene.light_kind[item] <= _DISK:
             off = wp.normalize(light_axis(scene, item))
-        p = lift(position + aim.way, off)
+        p = offset_from_light(position + aim.way, off)
         out.target = wp.vec4(p[0], p[1], p[2], 1.0)
-        out.density = aim.density * choice.probability
-        out.radiance = scene.light_radiance[item] / out.density
-        out.control = control_of(scene, item)
-        if only_sampled(scene, out.control):
-            out.density = 0.0
+        out.pdf = aim.pdf * choice.probability
+        out.radiance = scene.light_radiance[item] / out.pdf
+        out.modifiers = modifiers_of(scene, item)
+        if only_sampled(scene, out.modifiers):
+            out.pdf = 0.0
         return out
-    point = sample_emitter(scene, choice, u)
+    point = sample_emitter_area(scene, choice, u)
     xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
     to_light = xyz - position * point.position[3]
     squared = wp.dot(to_light, to_light)
@@ -66,23 +74,23 @@ def sample_arrival(scene: SceneData, position: wp.vec3, u_pick: float, u: wp.vec
     out.target = point.position
     out.radiance = point.intensity * per_area
     if per_area > 0.0:
-        out.density = point.density / per_area
-    out.control = point.control
+        out.pdf = point.pdf / per_area
+    out.modifiers = point.modifiers
     return out
 
 
 @wp.func
-def power_heuristic(density: float, other: float) -> float:
+def power_heuristic(pdf: float, other: float) -> float:
     """Weight of a sample that another way of sampling might have found as well (Veach 1997, β = 2).
 
     Where one way is nearly exact, as towards the lights, it leaves less of the other's noise than the balance does.
     """
-    ratio = other / density
+    ratio = other / pdf
     return 1.0 / (1.0 + ratio * ratio)
 
 
 @wp.func
-def choice_probability(scene: SceneData, emitter: int) -> float:
+def selection_probability(scene: SceneData, emitter: int) -> float:
     """With which an emitter is chosen."""
     if emitter < 0:
         return 0.0
@@ -90,36 +98,38 @@ def choice_probability(scene: SceneData, emitter: int) -> float:
 
 
 @wp.func
-def shape_density(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> float:
-    """The density per solid angle with which `sample_arrival` gives a direction that meets a shape at t."""
+def shape_pdf(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> float:
+    """The density per solid angle with which `sample_direct` gives a direction that meets a shape at t."""
     kind = scene.light_kind[light]
-    probability = choice_probability(scene, scene.light_emitter[light])
+    probability = selection_probability(scene, scene.light_emitter[light])
     texture = texture_of(scene, light)
     if texture < 0:
         to_light = scene.light_origin[light] - origin
-        return probability * aim_density(kind, scene.light_axes[light], scene.light_inverse[light], to_light, direction)
+        return probability * solid_angle_pdf(
+            kind, scene.light_axes[light], scene.light_inverse[light], to_light, direction
+        )
     n = wp.vec3(0.0, 0.0, 1.0)  # only rectangles have textures
     cosine = -wp.dot(wp.normalize(wp.transpose(scene.light_inverse[light]) * n), direction)
-    density = probability * t * t / (unit_area(kind) * area_scale(scene, light, n) * cosine)
-    place = texture_place(scene, light, origin, direction, t)
-    return density * place_density(scene.light_tables[0].grids, texture, place)
+    pdf = probability * t * t / (unit_area(kind) * area_scale(scene, light, n) * cosine)
+    place = texture_uv(scene, light, origin, direction, t)
+    return pdf * uv_pdf(scene.light_tables[0].distributions, texture, place)
 
 
 @wp.func
-def found_weight(bsdf_density: float, light_density: float) -> float:
+def mis_weight(bsdf_pdf: float, light_pdf: float) -> float:
     """Of a light that a ray has found; 1 if the ray was no sample of a BSDF."""
-    if bsdf_density < 0.0:
+    if bsdf_pdf < 0.0:
         return 1.0
-    return power_heuristic(bsdf_density, light_density)
+    return power_heuristic(bsdf_pdf, light_pdf)
 
 
 @wp.func
-def surface_weight(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_density: float) -> float:
+def surface_mis_weight(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_pdf: float) -> float:
     """The weight of the emission of an emissive surface that a unit direction, sampled from a BSDF, has hit."""
     a = scene.points[scene.indices[3 * hit.triangle]]
     b = scene.points[scene.indices[3 * hit.triangle + 1]]
     c = scene.points[scene.indices[3 * hit.triangle + 2]]
     area = 0.5 * wp.length(wp.cross(b - a, c - a)) * float(1 + scene.emits_back[hit.triangle])
     cosine = wp.max(-wp.dot(hit.normal, direction), 1.0e-20)
-    probability = choice_probability(scene, scene.triangle_emitter[hit.triangle])
-    return found_weight(bsdf_density, probability * hit.t * hit.t / (area * cosine))
+    probability = selection_probability(scene, scene.triangle_emitter[hit.triangle])
+    return mis_weight(bsdf_pdf, probability * hit.t * hit.t / (area * cosine))

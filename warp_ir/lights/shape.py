@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.sampling.distribution2d import value_at_place
+from warp_ir.sampling.distribution2d import value_at_uv
 from warp_ir.scene import LightKind
 
 wp.set_module_options({"enable_backward": False})
@@ -24,21 +24,21 @@ def texture_of(scene: SceneData, light: int) -> int:
 
 
 @wp.func
-def control_of(scene: SceneData, light: int) -> int:
+def modifiers_of(scene: SceneData, light: int) -> int:
     """The row of a light's control, or -1; light -1 is a surface."""
-    if scene.control_count == 0 or light < 0:
+    if scene.modifier_count == 0 or light < 0:
         return -1
-    return scene.light_tables[0].controls.of_light[light]
+    return scene.light_tables[0].modifiers.of_light[light]
 
 
 @wp.func
-def control_of_surface(scene: SceneData, triangle: int) -> int:
+def modifiers_of_surface(scene: SceneData, triangle: int) -> int:
     """The row of the control of an emissive surface, or -1."""
-    if scene.control_count == 0:
+    if scene.modifier_count == 0:
         return -1
-    if scene.light_tables[0].controls.surface_count == 0:
+    if scene.light_tables[0].modifiers.surface_count == 0:
         return -1
-    return scene.light_tables[0].controls.of_mesh[scene.triangle_mesh[triangle]]
+    return scene.light_tables[0].modifiers.of_mesh[scene.triangle_mesh[triangle]]
 
 
 @wp.func
@@ -80,7 +80,7 @@ def world_from_dome(scene: SceneData, light: int, d: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def hit_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec4:
+def intersect_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec4:
     """Where a ray meets the emitting side of a light: the unit shape's normal there, and t (-1: it does not)."""
     kind = scene.light_kind[light]
     o = scene.light_inverse[light] * (origin - scene.light_origin[light])
@@ -117,23 +117,23 @@ def hit_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3)
 
 
 @wp.func
-def face_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
+def shape_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
     """Radiance of a light with an area where a ray meets it, before shaping."""
     texture = texture_of(scene, light)
     if texture < 0:
         return scene.light_radiance[light]
-    place = texture_place(scene, light, origin, direction, t)
-    return wp.cw_mul(scene.light_radiance[light], value_at_place(scene.light_tables[0].grids, texture, place))
+    place = texture_uv(scene, light, origin, direction, t)
+    return wp.cw_mul(scene.light_radiance[light], value_at_uv(scene.light_tables[0].distributions, texture, place))
 
 
 @wp.func
-def texture_place(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
+def texture_uv(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
     """Place in [0, 1]² on the texture of a rectangle that a ray meets at t: from +X to -X, from +Y to -Y."""
     q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
     return wp.vec2(0.5 - q[0], 0.5 - q[1])
 
 
 @wp.func
-def lift(p: wp.vec3, direction: wp.vec3) -> wp.vec3:
+def offset_from_light(p: wp.vec3, direction: wp.vec3) -> wp.vec3:
     """A place on a light, moved by 8 ulp along a unit direction: a light often lies in the ceiling's plane."""
     return p + direction * (wp.max(wp.abs(p)) * _EIGHT_ULP)

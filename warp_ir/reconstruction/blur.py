@@ -11,15 +11,22 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.film.accumulate import FilmData
-from warp_ir.gbuffer import Sight, anchor_of, camera_ray, jitter, lens_point, project, see
-from warp_ir.reconstruction.compose import Picture, as_sampled, by_rays, edge_rays, on_surface, show
-from warp_ir.reconstruction.edges import Lit, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
-from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
+from warp_ir.gbuffer import CameraHit, camera_ray, jitter, lens_point, project, surface_point_of, trace_camera_ray
+from warp_ir.reconstruction.compose import (
+    ResolvedPicture,
+    edge_rays,
+    filtered_estimate,
+    plain_estimate,
+    show,
+    supersampled_estimate,
+)
+from warp_ir.reconstruction.edges import Irradiance, Pixel, add_neighbor, interpolate, mean_of_rays, on_edge
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels
 from warp_ir.reconstruction.pixel_surfaces import MATCH, same_surface
-from warp_ir.reconstruction.reprojection import Blur, at_middle
-from warp_ir.reconstruction.sample_buffer import Observations
+from warp_ir.reconstruction.reprojection import Blur, at_reference_time
+from warp_ir.reconstruction.sample_buffer import SampleBuffer
 from warp_ir.sampling.sobol import stratum_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -48,15 +55,15 @@ class _Mean:
 class _Other:
     """The light on what no pixel shows."""
 
-    lit: Lit
+    lit: Irradiance
     known: int  # 1: by samples of such surfaces nearby
 
 
 @wp.func
-def _others(seen: Observations, p: int, raw_direct: wp.vec3, raw_indirect: wp.vec3, albedo: wp.vec3) -> _Other:
+def _others(seen: SampleBuffer, p: int, raw_direct: wp.vec3, raw_indirect: wp.vec3, albedo: wp.vec3) -> _Other:
     """It is that of such samples around a pixel, if there were any, or that of all the pixel's."""
     surfaces = seen.surfaces
-    lit = Lit()
+    lit = Irradiance()
     for dy in range(-2, 3):
         for dx in range(-2, 3):
             x = p % surfaces.columns + dx
@@ -80,7 +87,9 @@ def _others(seen: Observations, p: int, raw_direct: wp.vec3, raw_indirect: wp.ve
 
 
 @wp.func
-def _lit(blur: Blur, seen: Observations, layer: Layer, point: Sight, place: wp.vec2, farthest: int) -> Lit:
+def _lit(
+    blur: Blur, seen: SampleBuffer, layer: IrradianceLayer, point: CameraHit, place: wp.vec2, farthest: int
+) -> Irradiance:
     """Irradiance at a point of the middle moment: where it is seen through the lens' middle, or as near as may be."""
     camera = blur.cameras[blur.middle]
     column = int(wp.clamp(wp.floor(place[0]), 0.0, float(camera.columns - 1)))
@@ -102,7 +111,7 @@ def _lit(blur: Blur, seen: Observations, layer: Layer, point: Sight, place: wp.v
 
 @wp.func
 def _look_through(
-    blur: Blur, seen: Observations, layer: Layer, p: int, other: _Other, rays: wp.vec2i, mixed: bool
+    blur: Blur, seen: SampleBuffer, layer: IrradianceLayer, p: int, other: _Other, rays: wp.vec2i, mixed: bool
 ) -> _Mean:
     """Sends rays through a pixel, the lens and the time: as many as `rays` says, the first of which are the film's.
 
@@ -121,7 +130,9 @@ def _look_through(
         camera = blur.cameras[moment]
         scene = blur.scenes[moment]
         u = jitter(scene, camera, p, out.rays, seen.seed)
-        point = see(scene, camera, camera_ray(camera, p, u, lens_point(scene, camera, p, out.rays, seen.seed)))
+        point = trace_camera_ray(
+            scene, camera, camera_ray(camera, p, u, lens_point(scene, camera, p, out.rays, seen.seed))
+        )
         if out.rays == 0:
             first_albedo = point.albedo
             first_emission = point.emission
@@ -133,7 +144,7 @@ def _look_through(
         out.albedo += point.albedo
         out.normal += point.shading_normal
         if point.mesh >= 0:
-            there = at_middle(blur, moment, anchor_of(point.hit), point.position, point.smooth_normal)
+            there = at_reference_time(blur, moment, surface_point_of(point.hit), point.position, point.smooth_normal)
             point.position = there.position
             point.smooth_normal = there.normal
             place = project(middle, there.position)
@@ -164,21 +175,27 @@ def _look_through(
     return mean
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _compose(
-    first: int, blur: Blur, seen: Observations, layer: Layer, film: FilmData, exposure: float, out: Picture
+    first: int,
+    blur: Blur,
+    seen: SampleBuffer,
+    layer: IrradianceLayer,
+    film: FilmData,
+    exposure: float,
+    out: ResolvedPicture,
 ) -> None:
     """Radiance of a pixel: that of its surface, or that of all it shows, and how far the film's mean is off that."""
     p = first + wp.tid()
-    shown = as_sampled(film, p)
+    shown = plain_estimate(film, p)
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     other = _others(seen, p, shown.direct / exposure, shown.indirect / exposure, shown.albedo)
     edge = on_edge(seen.surfaces, film, p)
     mean = _look_through(blur, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays), edge)
     if mean.blurred == 1 or edge or layer.direct[p][3] < 0.0:
-        shown = by_rays(shown, film, mean.pixel, p, 1.0, out)
+        shown = supersampled_estimate(shown, film, mean.pixel, p, 1.0, out)
     else:
-        shown = on_surface(shown, seen, layer, p, exposure, float(film.count[p]))
+        shown = filtered_estimate(shown, seen, layer, p, exposure, float(film.count[p]))
     show(out, p, shown)
 
 
@@ -188,5 +205,5 @@ def blur_rays(iterations: int) -> int:
 
 
 def compose_blurred(blur: Any, seen: Any, layer: Any, film: Any, exposure: float, out: Any, launcher: Launcher) -> None:
-    """Fills a `Picture` of a blurred view from a filtered `Layer`; `exposure` is the mean over the moments."""
+    """Fills a `ResolvedPicture` of a blurred view from a filtered layer; `exposure` is the mean over the shutter."""
     launcher.launch(_compose, seen.count.shape[0], [blur, seen, layer, film, exposure, out])

@@ -4,13 +4,13 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
-from warp_ir.reconstruction.edges import Lit, Pixel, look_closely, on_edge
-from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels, value
-from warp_ir.reconstruction.pixel_surfaces import Surfaces
-from warp_ir.reconstruction.sample_buffer import Observations
+from warp_ir.reconstruction.edges import Irradiance, Pixel, on_edge, supersample_edge
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels, value
+from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
+from warp_ir.reconstruction.sample_buffer import SampleBuffer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -20,11 +20,13 @@ _WINDOW = wp.constant(2)  # pixels to each side that tell how much of a differen
 
 
 @wp.struct
-class Picture:
+class ResolvedPicture:
     """What becomes of it all, and what it lacks on edges."""
 
     rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; if there are five, albedo, normal, plain mean
-    rest: Layer  # plain mean less picture, and how large noise makes its square on average; -1: not on an edge
+    rest: (
+        IrradianceLayer  # plain mean less picture, and how large noise makes its square on average; -1: not on an edge
+    )
     edge_rays: int
 
 
@@ -35,7 +37,7 @@ def _student(n: float) -> float:
 
 
 @wp.func
-def give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
+def shrink_to_mean(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
     """What is to be believed of a difference between the plain mean and the result, by itself."""
     d = mean_channel(difference)
     ratio = _TRUST * _TRUST * _student(n) * variance / (d * d + 1.0e-30)
@@ -43,7 +45,7 @@ def give_back(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
 
 
 @wp.struct
-class Shown:
+class ResolvedPixel:
     """A pixel: radiance by what emits, by way of lights and of surfaces, features, and the plain mean."""
 
     emitted: wp.vec3
@@ -55,9 +57,9 @@ class Shown:
 
 
 @wp.func
-def as_sampled(film: FilmData, p: int) -> Shown:
+def plain_estimate(film: FilmData, p: int) -> ResolvedPixel:
     """The film's own means."""
-    x = Shown()
+    x = ResolvedPixel()
     x.emitted = emission_of(film, p)
     x.direct = film.direct[p]
     x.indirect = film.indirect[p]
@@ -68,20 +70,24 @@ def as_sampled(film: FilmData, p: int) -> Shown:
 
 
 @wp.func
-def on_surface(sampled: Shown, seen: Observations, layer: Layer, p: int, exposure: float, n: float) -> Shown:
+def filtered_estimate(
+    sampled: ResolvedPixel, seen: SampleBuffer, layer: IrradianceLayer, p: int, exposure: float, n: float
+) -> ResolvedPixel:
     """The filtered light of a pixel that shows one surface, unless the film's mean contradicts it."""
     x = sampled
     reflected = mean_channel(x.albedo) * exposure
     noise = seen.noise[p] * (reflected * reflected / n)
     x.direct = wp.cw_mul(x.albedo, value(layer.direct[p])) * exposure
     x.indirect = wp.cw_mul(x.albedo, value(layer.indirect[p])) * exposure
-    x.direct += give_back(sampled.direct - x.direct, noise[0], n)
-    x.indirect += give_back(sampled.indirect - x.indirect, noise[1], n)
+    x.direct += shrink_to_mean(sampled.direct - x.direct, noise[0], n)
+    x.indirect += shrink_to_mean(sampled.indirect - x.indirect, noise[1], n)
     return x
 
 
 @wp.func
-def by_rays(sampled: Shown, film: FilmData, pixel: Pixel, p: int, exposure: float, out: Picture) -> Shown:
+def supersampled_estimate(
+    sampled: ResolvedPixel, film: FilmData, pixel: Pixel, p: int, exposure: float, out: ResolvedPicture
+) -> ResolvedPixel:
     """What many rays found, times `exposure`; notes how far the plain mean of the film's own is off."""
     x = sampled
     if pixel.rays > film.count[p]:
@@ -104,7 +110,7 @@ def by_rays(sampled: Shown, film: FilmData, pixel: Pixel, p: int, exposure: floa
 
 
 @wp.func
-def show(out: Picture, p: int, x: Shown) -> None:
+def show(out: ResolvedPicture, p: int, x: ResolvedPixel) -> None:
     """Fills a pixel's rows."""
     if out.rows.shape[0] > 2:
         out.rows[2, p] = x.albedo
@@ -114,26 +120,26 @@ def show(out: Picture, p: int, x: Shown) -> None:
     out.rows[1, p] = x.indirect
 
 
-@wp.kernel(module="warp_ir.gbuffer", cuda_max_registers=MOST_REGISTERS)  # so that camera rays are compiled once
+@wp.kernel(module="warp_ir.gbuffer", cuda_max_registers=MAX_REGISTERS)  # so that camera rays are compiled once
 def _compose(
     first: int,
     scene: SceneData,
     camera: CameraData,
-    seen: Observations,
-    layer: Layer,
+    seen: SampleBuffer,
+    layer: IrradianceLayer,
     film: FilmData,
     exposure: float,
-    out: Picture,
+    out: ResolvedPicture,
 ) -> None:
     """Radiance of a pixel from irradiance on surfaces; on edges, how far the plain mean of the same rays is off."""
     p = first + wp.tid()
     surfaces = seen.surfaces
-    sampled = as_sampled(film, p)
+    sampled = plain_estimate(film, p)
     shown = sampled
     out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     if seen.count[p] != film.count[p] or on_edge(surfaces, film, p):
         # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
-        other = Lit()
+        other = Irradiance()
         other.weight = float(seen.other_count[p])
         other.direct = seen.other_direct[p]
         other.indirect = seen.other_indirect[p]
@@ -143,15 +149,15 @@ def _compose(
             other.indirect = wp.cw_div(sampled.indirect, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
         means = mean_channels(other.direct, other.indirect)
         other.noise = wp.cw_mul(means, means) / other.weight
-        pixel = look_closely(scene, camera, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays))
-        shown = by_rays(sampled, film, pixel, p, exposure, out)
+        pixel = supersample_edge(scene, camera, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays))
+        shown = supersampled_estimate(sampled, film, pixel, p, exposure, out)
     elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
-        shown = on_surface(sampled, seen, layer, p, exposure, float(film.count[p]))
+        shown = filtered_estimate(sampled, seen, layer, p, exposure, float(film.count[p]))
     show(out, p, shown)
 
 
 @wp.kernel
-def _correct_edges(first: int, surfaces: Surfaces, out: Picture) -> None:
+def _correct_edges(first: int, surfaces: PixelSurfaces, out: ResolvedPicture) -> None:
     """Gives back to pixels on edges what is not noise in their difference to the plain mean.
 
     That of a few pixels together is known best: if noise alone made the differences, their squares would be as large
@@ -184,9 +190,9 @@ def edge_rays(iterations: int) -> int:
     return min(16 + 2 * iterations, _MOST_EDGE_RAYS)
 
 
-def new_picture(pixels: int, rest: Any, rays: int, features: bool, launcher: Launcher) -> Any:
-    """An uninitialised `Picture`; `rest` is a `Layer` to be overwritten, `rays` are those of a pixel on an edge."""
-    out = Picture()
+def new_resolved_picture(pixels: int, rest: Any, rays: int, features: bool, launcher: Launcher) -> Any:
+    """An uninitialised `ResolvedPicture`; `rest` is overwritten, `rays` are those of a pixel on an edge."""
+    out = ResolvedPicture()
     out.rest = rest
     out.rows = launcher.empty((5 if features else 2, pixels), wp.vec3)
     out.edge_rays = rays
@@ -196,10 +202,10 @@ def new_picture(pixels: int, rest: Any, rays: int, features: bool, launcher: Lau
 def compose(
     scene: DeviceScene, camera: Any, seen: Any, layer: Any, film: Any, exposure: float, out: Any, launcher: Launcher
 ) -> None:
-    """Fills a `Picture` from a filtered `Layer`."""
+    """Fills a `ResolvedPicture` from a filtered `IrradianceLayer`."""
     launcher.launch(_compose, camera.columns * camera.rows, [scene.data, camera, seen, layer, film, exposure, out])
 
 
 def correct_edges(surfaces: Any, out: Any, launcher: Launcher) -> None:
-    """Gives back to a `Picture` what it lacks on edges."""
+    """Gives back to a `ResolvedPicture` what it lacks on edges."""
     launcher.launch(_correct_edges, surfaces.columns * surfaces.rows, [surfaces, out])

@@ -4,10 +4,10 @@ import warp as wp
 
 from warp_ir.device_scene import CameraData, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
-from warp_ir.gbuffer import Sight, camera_ray, jitter, see
-from warp_ir.reconstruction.filter import Layer, mean_channel, value
-from warp_ir.reconstruction.pixel_surfaces import MATCH, Surfaces, pixel_around, same_surface
-from warp_ir.reconstruction.sample_buffer import Observations
+from warp_ir.gbuffer import CameraHit, camera_ray, jitter, trace_camera_ray
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, value
+from warp_ir.reconstruction.pixel_surfaces import MATCH, PixelSurfaces, pixel_around, same_surface
+from warp_ir.reconstruction.sample_buffer import SampleBuffer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -15,7 +15,7 @@ _PROBES = wp.constant(8)  # rays, to see whether the edge is in the pixel
 
 
 @wp.func
-def on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
+def on_edge(surfaces: PixelSurfaces, film: FilmData, p: int) -> bool:
     """Whether any of the eight neighbours shows another surface, or none, or one that emits differently."""
     if surfaces.bordering[p] == wp.uint8(1):
         return True
@@ -32,7 +32,7 @@ def on_edge(surfaces: Surfaces, film: FilmData, p: int) -> bool:
 
 
 @wp.struct
-class Lit:
+class Irradiance:
     """Irradiance over π in two parts, and the variance of a sample of them, all times the weight."""
 
     direct: wp.vec3
@@ -42,7 +42,9 @@ class Lit:
 
 
 @wp.func
-def add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point: Sight, lit: Lit) -> Lit:
+def add_neighbor(
+    seen: SampleBuffer, layer: IrradianceLayer, q: int, away: wp.vec2, point: CameraHit, lit: Irradiance
+) -> Irradiance:
     """Adds the irradiance of pixel `q`, if it shows the surface of a point seen `away` from its centre [pixels]."""
     out = lit
     direct = layer.direct[q]
@@ -58,12 +60,14 @@ def add_neighbor(seen: Observations, layer: Layer, q: int, away: wp.vec2, point:
 
 
 @wp.func
-def interpolate(seen: Observations, layer: Layer, row: int, column: int, u: wp.vec2, point: Sight) -> Lit:
+def interpolate(
+    seen: SampleBuffer, layer: IrradianceLayer, row: int, column: int, u: wp.vec2, point: CameraHit
+) -> Irradiance:
     """Irradiance at a point seen through (u, v) of a pixel: from the four pixels around that show its surface.
 
     Or from any of the nine, if none of the four does.
     """
-    lit = Lit()
+    lit = Irradiance()
     surfaces = seen.surfaces
     nearest_x = wp.where(u[0] < 0.5, -1, 1)
     nearest_y = wp.where(u[1] < 0.5, -1, 1)
@@ -108,8 +112,14 @@ def mean_of_rays(sums: Pixel) -> Pixel:
 
 
 @wp.func
-def look_closely(
-    scene: SceneData, camera: CameraData, seen: Observations, layer: Layer, p: int, other: Lit, rays: wp.vec2i
+def supersample_edge(
+    scene: SceneData,
+    camera: CameraData,
+    seen: SampleBuffer,
+    layer: IrradianceLayer,
+    p: int,
+    other: Irradiance,
+    rays: wp.vec2i,
 ) -> Pixel:
     """Sends rays through a pixel on an edge: as many as `rays` says, the first of which are those of the film.
 
@@ -124,7 +134,7 @@ def look_closely(
     out = Pixel()
     while out.rays < rays[1] and (mixed or out.rays < _PROBES):
         u = jitter(scene, camera, p, out.rays, seen.seed)
-        point = see(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
+        point = trace_camera_ray(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
         if out.rays == 0:
             first_albedo = point.albedo
             first_emission = point.emission

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.reconstruction.pixel_surfaces import Surfaces, fits
+from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces, fits
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -25,7 +25,7 @@ _NARROW = 0.45
 
 
 @wp.struct
-class Layer:
+class IrradianceLayer:
     """An image of irradiance over π in two parts, each with the variance of its mean channel; -1: no value."""
 
     direct: wp.array[wp.vec4]
@@ -46,7 +46,7 @@ def mean_channels(direct: wp.vec3, indirect: wp.vec3) -> wp.vec2:
 
 @wp.func
 def value(row: wp.vec4) -> wp.vec3:
-    """Irradiance over π of a row of a `Layer`, without its variance."""
+    """Irradiance over π of a row of a `IrradianceLayer`, without its variance."""
     return wp.vec3(row[0], row[1], row[2])
 
 
@@ -65,7 +65,9 @@ def _alike(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
 
 
 @wp.kernel
-def _filter_level(first: int, surfaces: Surfaces, source: Layer, out: Layer, step: int, sigmas: wp.vec2) -> None:
+def _filter_level(
+    first: int, surfaces: PixelSurfaces, source: IrradianceLayer, out: IrradianceLayer, step: int, sigmas: wp.vec2
+) -> None:
     """One pass of 3 x 3 taps, `step` pixels apart."""
     p = first + wp.tid()
     here = source.direct[p]
@@ -114,14 +116,14 @@ def _normalized(sum: wp.vec4, weight: float) -> wp.vec4:
 
 
 def new_layer(direct: Any, indirect: Any) -> Any:
-    """A `Layer` of two arrays."""
-    layer = Layer()
+    """A `IrradianceLayer` of two arrays."""
+    layer = IrradianceLayer()
     layer.direct, layer.indirect = direct, indirect
     return layer
 
 
 def filter_layer(surfaces: Any, layer: Any, other: Any, launcher: Launcher) -> tuple[Any, Any]:
-    """The filtered `Layer`, and one to be overwritten: both given ones are used up."""
+    """The filtered `IrradianceLayer`, and one to be overwritten: both given ones are used up."""
     pixels = surfaces.columns * surfaces.rows
     for level in range(LEVELS):
         sigmas = wp.vec2(*(sigma * _NARROW**level for sigma in _SIGMAS))

@@ -10,7 +10,7 @@ _PLANE = wp.constant(4.0)  # footprints off the plane at which a point belongs t
 
 
 @wp.struct
-class Surfaces:
+class PixelSurfaces:
     """One row for each pixel of an image."""
 
     columns: int
@@ -29,7 +29,7 @@ def _window(x: float) -> float:
 
 
 @wp.func
-def fits(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
+def fits(surfaces: PixelSurfaces, p: int, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
     """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0.
 
     Then the same for light from all around, which changes less as a surface turns.
@@ -48,13 +48,13 @@ def fits(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> wp.v
 
 
 @wp.func
-def same_surface(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
+def same_surface(surfaces: PixelSurfaces, p: int, position: wp.vec3, normal: wp.vec3) -> float:
     """How well a point belongs to the surface of pixel `p`: 1 on its plane and facing its way, falling to 0."""
     return fits(surfaces, p, position, normal)[0]
 
 
 @wp.func
-def pixel_around(surfaces: Surfaces, p: int, k: int) -> int:
+def pixel_around(surfaces: PixelSurfaces, p: int, k: int) -> int:
     """The k-th of the nine pixels around `p`, itself among them; itself as well where the image ends."""
     x = p % surfaces.columns + k % 3 - 1
     y = p // surfaces.columns + k // 3 - 1
@@ -64,7 +64,7 @@ def pixel_around(surfaces: Surfaces, p: int, k: int) -> int:
 
 
 @wp.func
-def shown_nearby(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3) -> bool:
+def shown_nearby(surfaces: PixelSurfaces, p: int, position: wp.vec3, normal: wp.vec3) -> bool:
     """Whether a pixel or one of its eight neighbours shows the surface of a point."""
     for k in range(9):
         if same_surface(surfaces, pixel_around(surfaces, p, k), position, normal) > MATCH:
@@ -73,7 +73,7 @@ def shown_nearby(surfaces: Surfaces, p: int, position: wp.vec3, normal: wp.vec3)
 
 
 @wp.func
-def differ(surfaces: Surfaces, p: int, q: int) -> bool:
+def differ(surfaces: PixelSurfaces, p: int, q: int) -> bool:
     """Whether two pixels show different surfaces, or only one shows any."""
     if surfaces.footprint[p] <= 0.0 and surfaces.footprint[q] <= 0.0:
         return False

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import Launcher, carve, floats
+from warp_ir.device.launcher import Launcher, floats, partition
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
-from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_picture
+from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture
 from warp_ir.reconstruction.filter import filter_layer, new_layer
-from warp_ir.reconstruction.reprojection import Moment, guess_noise, new_blur, observe_blurred
-from warp_ir.reconstruction.sample_buffer import average, look, observe, sums
+from warp_ir.reconstruction.reprojection import ShutterSample, accumulate_blurred, estimate_missing_noise, new_blur
+from warp_ir.reconstruction.sample_buffer import accumulate, estimate_means, new_sample_buffer, sample_sums
 
 _FILTER_PASSES = 6.0
 """Filtering takes as long as so many passes of camera rays: fewer where rays are dear."""
@@ -25,7 +25,9 @@ SCRATCH = floats(*_TYPES)
 class Reconstruction:
     """Gathers what the filter needs beside the film, and makes the picture of both."""
 
-    def __init__(self, moments: Sequence[Moment], launcher: Launcher, gbuffer: Any, block: Any, seed: int) -> None:
+    def __init__(
+        self, moments: Sequence[ShutterSample], launcher: Launcher, gbuffer: Any, block: Any, seed: int
+    ) -> None:
         """Looks through the centre of every pixel.
 
         Args:
@@ -40,19 +42,19 @@ class Reconstruction:
         self._exposure = sum(m.exposure for m in moments) / len(moments)
         self._launcher, self._block = launcher, weakref.ref(block)
         with launcher.phase("filter"):
-            self._seen, self._on_edges = look(self._scene, self._camera, launcher, gbuffer, seed)
+            self._seen, self._on_edges = new_sample_buffer(self._scene, self._camera, launcher, gbuffer, seed)
             self._blur = new_blur(moments, launcher) if self._camera.blurs else None
 
-    def observe(self, gbuffer: Any, direct: Any, indirect: Any, moment: int = 0) -> None:
+    def accumulate(self, gbuffer: Any, direct: Any, indirect: Any, moment: int = 0) -> None:
         """Adds one iteration's samples of irradiance over π, made at one of the moments."""
         if self._blur is not None:
-            observe_blurred(self._blur, self._seen, moment, gbuffer, direct, indirect, self._launcher)
+            accumulate_blurred(self._blur, self._seen, moment, gbuffer, direct, indirect, self._launcher)
         else:
-            observe(self._seen, gbuffer, direct, indirect, self._launcher)
+            accumulate(self._seen, gbuffer, direct, indirect, self._launcher)
 
     def arrays(self) -> dict[str, Any]:
         """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""
-        return sums(self._seen)
+        return sample_sums(self._seen)
 
     def merge(self, other: "Reconstruction") -> None:
         """Adds another's samples."""
@@ -77,14 +79,14 @@ class Reconstruction:
             block = self._block()
             if block is None:
                 block = launcher.empty(SCRATCH * camera.columns * camera.rows, wp.float32)
-            *layers, noise = carve(block, camera.columns * camera.rows, _TYPES)
+            *layers, noise = partition(block, camera.columns * camera.rows, _TYPES)
             layer, other = new_layer(*layers[:2]), new_layer(*layers[2:])
-            seen = average(self._seen, noise, layer, launcher)
+            seen = estimate_means(self._seen, noise, layer, launcher)
             layer, rest = filter_layer(seen.surfaces, layer, other, launcher)
             rays = edge_rays(iterations) if self._blur is None else blur_rays(iterations)
-            out = new_picture(seen.count.shape[0], rest, rays, features, launcher)
+            out = new_resolved_picture(seen.count.shape[0], rest, rays, features, launcher)
             if self._blur is not None:
-                guess_noise(seen, launcher)
+                estimate_missing_noise(seen, launcher)
                 compose_blurred(self._blur, seen, layer, film, self._exposure, out, launcher)
             else:
                 compose(self._scene, camera, seen, layer, film, self._exposure, out, launcher)

@@ -13,16 +13,16 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import Anchor, GBuffer, project
+from warp_ir.gbuffer import GBuffer, SurfacePoint, project
 from warp_ir.reconstruction.pixel_surfaces import MATCH, pixel_around, same_surface
-from warp_ir.reconstruction.sample_buffer import Observations, add_other, add_sample
+from warp_ir.reconstruction.sample_buffer import SampleBuffer, add_other, add_sample
 from warp_ir.surface import Hit, scene_at, shading_normal
 from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
-class Moment(Protocol):
+class ShutterSample(Protocol):
     """The scene and the camera at one moment, and what the camera multiplies light by."""
 
     @property
@@ -59,14 +59,14 @@ class Point:
 
 
 @wp.func(inline=False)
-def _placed(address: wp.uint64, anchor: Anchor, triangle: int, facing: wp.vec3) -> Point:
+def _placed(address: wp.uint64, surface_point: SurfacePoint, triangle: int, facing: wp.vec3) -> Point:
     """Where a point of a triangle is; its normal is on the side of `facing`."""
     scene = scene_at(address)[0]
     hit = Hit()
     hit.triangle = triangle
-    hit.instance = anchor.instance
-    hit.u = float(anchor.weights >> wp.uint32(16)) / 65535.0
-    hit.v = float(anchor.weights & wp.uint32(65535)) / 65535.0
+    hit.instance = surface_point.instance
+    hit.u = float(surface_point.weights >> wp.uint32(16)) / 65535.0
+    hit.v = float(surface_point.weights & wp.uint32(65535)) / 65535.0
     a = scene.points[scene.indices[3 * triangle]]
     b = scene.points[scene.indices[3 * triangle + 1]]
     c = scene.points[scene.indices[3 * triangle + 2]]
@@ -82,18 +82,20 @@ def _placed(address: wp.uint64, anchor: Anchor, triangle: int, facing: wp.vec3) 
 
 
 @wp.func
-def at_middle(blur: Blur, moment: int, anchor: Anchor, position: wp.vec3, normal: wp.vec3) -> Point:
+def at_reference_time(
+    blur: Blur, moment: int, surface_point: SurfacePoint, position: wp.vec3, normal: wp.vec3
+) -> Point:
     """Where a point of a moment is at the moment in the middle. Normals turn little while a shutter is open."""
     out = Point()
     out.position = position
     out.normal = normal
-    moving = anchor.triangle >= blur.first_moving
-    if blur.moves == 1 and moment != blur.middle and (moving or anchor.instance >= 0):
-        row = anchor.triangle
+    moving = surface_point.triangle >= blur.first_moving
+    if blur.moves == 1 and moment != blur.middle and (moving or surface_point.instance >= 0):
+        row = surface_point.triangle
         if moving:
             row -= blur.shifts[moment]
-        there = _placed(blur.scenes[moment].address, anchor, anchor.triangle, normal)
-        here = _placed(blur.scenes[blur.middle].address, anchor, row, normal)
+        there = _placed(blur.scenes[moment].address, surface_point, surface_point.triangle, normal)
+        here = _placed(blur.scenes[blur.middle].address, surface_point, row, normal)
         # What the point is off its triangle, as on smooth surfaces, it stays.
         out.position += here.position - there.position
         out.normal += here.normal - there.normal
@@ -108,7 +110,7 @@ def _aim(
     gbuffer: GBuffer,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
-    seen: Observations,
+    seen: SampleBuffer,
     pixels: wp.array2d[wp.int32],
 ) -> None:
     """Says for which pixel each sample is (first row); those that no pixel's centre shows stay where they are."""
@@ -119,10 +121,10 @@ def _aim(
     pixels[0, i] = none
     pixels[1, i] = p
     if p >= 0 and gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
-        anchor = Anchor()
+        surface_point = SurfacePoint()
         if blur.moves == 1:
-            anchor = gbuffer.anchor[p]
-        point = at_middle(blur, moment, anchor, gbuffer.position[p], gbuffer.smooth_normal[p])
+            surface_point = gbuffer.surface_point[p]
+        point = at_reference_time(blur, moment, surface_point, gbuffer.position[p], gbuffer.smooth_normal[p])
         place = project(blur.cameras[blur.middle], point.position)
         x = int(wp.floor(place[0]))
         y = int(wp.floor(place[1]))
@@ -146,7 +148,7 @@ def _take(
     pixels: wp.array2d[wp.int32],
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
-    seen: Observations,
+    seen: SampleBuffer,
 ) -> None:
     """Adds to each pixel the samples that are for it: a run of the sorted ones."""
     p = first + wp.tid()
@@ -157,7 +159,7 @@ def _take(
 
 
 @wp.kernel(module="warp_ir.reconstruction.blur")
-def _guess_noise(first: int, seen: Observations) -> None:
+def _estimate_missing_noise(first: int, seen: SampleBuffer) -> None:
     """Of pixels without samples: the noise of their neighbours' on the same surface."""
     p = first + wp.tid()
     surfaces = seen.surfaces
@@ -184,7 +186,7 @@ def surfaces_move(scenes: Sequence[DeviceScene]) -> bool:
     return any(s.rows != first.rows for s in scenes) or any(p != places[0] for p in places)
 
 
-def new_blur(moments: Sequence[Moment], launcher: Launcher) -> Any:
+def new_blur(moments: Sequence[ShutterSample], launcher: Launcher) -> Any:
     """The `Blur` of the moments of a scene; their number is a power of two."""
     blur = Blur()
     blur.bits, blur.middle = len(moments).bit_length() - 1, len(moments) // 2
@@ -215,17 +217,17 @@ def _shift(one: DeviceScene, other: DeviceScene) -> int | None:
     return None if len(shifts) > 1 else next(iter(shifts), 0)
 
 
-def observe_blurred(
+def accumulate_blurred(
     blur: Any, seen: Any, moment: int, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher
 ) -> None:
-    """Adds one iteration's samples of irradiance over π, made at a moment, to `Observations`."""
+    """Adds one iteration's samples of irradiance over π, made at a moment, to `SampleBuffer`."""
     count = indices(gbuffer.tiles)
-    order = launcher.kept("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
+    order = launcher.scratch("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
     launcher.launch(_aim, count, [blur, moment, gbuffer, direct, indirect, seen, order])
     wp.utils.radix_sort_pairs(order[0], order[1], count)
     launcher.launch(_take, seen.count.shape[0], [count, order, direct, indirect, seen])
 
 
-def guess_noise(seen: Any, launcher: Launcher) -> None:
-    """Completes the noise of `Observations` where they have no samples."""
-    launcher.launch(_guess_noise, seen.count.shape[0], [seen])
+def estimate_missing_noise(seen: Any, launcher: Launcher) -> None:
+    """Completes the noise of `SampleBuffer` where they have no samples."""
+    launcher.launch(_estimate_missing_noise, seen.count.shape[0], [seen])

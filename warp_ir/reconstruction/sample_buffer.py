@@ -4,11 +4,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import Launcher, copied
+from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.gbuffer import GBuffer, trace_primary
-from warp_ir.reconstruction.filter import Layer, mean_channel, mean_channels
-from warp_ir.reconstruction.pixel_surfaces import MATCH, Surfaces, differ, pixel_around, same_surface, shown_nearby
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels
+from warp_ir.reconstruction.pixel_surfaces import MATCH, PixelSurfaces, differ, pixel_around, same_surface, shown_nearby
 from warp_ir.tiles import indices, pixel_at
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -18,10 +18,10 @@ _AROUND = wp.constant(4.0)  # samples of its own that outweigh what the neighbou
 
 
 @wp.struct
-class Observations:
+class SampleBuffer:
     """Sums over the samples of irradiance over π that fell on each pixel's surface, and of those on no pixel's."""
 
-    surfaces: Surfaces
+    surfaces: PixelSurfaces
     direct: wp.array[wp.vec3]
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the two mean channels
@@ -34,7 +34,7 @@ class Observations:
 
 
 @wp.kernel
-def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) -> None:
+def _store_pixel_surfaces(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: PixelSurfaces) -> None:
     """Notes what is seen through the centre of each pixel."""
     p = first + wp.tid()
     surfaces.footprint[p] = 0.0
@@ -46,7 +46,7 @@ def _look(first: int, camera: CameraData, gbuffer: GBuffer, surfaces: Surfaces) 
 
 
 @wp.kernel
-def _find_edges(first: int, surfaces: Surfaces) -> None:
+def _find_edges(first: int, surfaces: PixelSurfaces) -> None:
     """Notes where any of the eight neighbours shows something else."""
     p = first + wp.tid()
     surfaces.bordering[p] = wp.uint8(0)
@@ -56,7 +56,7 @@ def _find_edges(first: int, surfaces: Surfaces) -> None:
 
 
 @wp.func
-def add_sample(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
+def add_sample(seen: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
     """Adds a sample to those on a pixel's surface, if it is finite."""
     d = mean_channel(direct)
     i = mean_channel(indirect)
@@ -68,7 +68,7 @@ def add_sample(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) -
 
 
 @wp.func
-def add_other(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
+def add_other(seen: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
     """Adds a sample to those on surfaces that no pixel shows, if it is finite."""
     if wp.isfinite(mean_channel(direct)) and wp.isfinite(mean_channel(indirect)):
         seen.other_direct[p] += direct
@@ -77,12 +77,12 @@ def add_other(seen: Observations, p: int, direct: wp.vec3, indirect: wp.vec3) ->
 
 
 @wp.kernel
-def _observe(
+def _accumulate_samples(
     first: int,
     gbuffer: GBuffer,
     direct: wp.array[wp.vec3],
     indirect: wp.array[wp.vec3],
-    seen: Observations,
+    seen: SampleBuffer,
 ) -> None:
     """Adds one iteration's sample of a pixel to those on its surface, or on none."""
     p = pixel_at(gbuffer.tiles, first + wp.tid())
@@ -97,7 +97,7 @@ def _observe(
 
 
 @wp.kernel
-def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> None:
+def _estimate_means(first: int, surfaces: PixelSurfaces, seen: SampleBuffer, out: IrradianceLayer) -> None:
     """Means and their variance, from the spread of the pixel and, more so the fewer its samples, of its neighbours.
 
     While every pixel has one sample, the spread from pixel to pixel serves.
@@ -121,13 +121,13 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
                 if seen.count[q] > 0:
                     w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
                     if w > 0.0:
-                        sums = w * mean_channels(seen.direct[q], seen.indirect[q])
-                        firsts += sums
+                        sample_sums = w * mean_channels(seen.direct[q], seen.indirect[q])
+                        firsts += sample_sums
                         squares += w * seen.squares[q]
                         samples += w * float(seen.count[q])
                         if seen.count[q] > 1:
                             spread += w * _spread(seen, q)
-                            around += sums * (float(seen.count[q] - 1) / float(seen.count[q]))
+                            around += sample_sums * (float(seen.count[q] - 1) / float(seen.count[q]))
                             weights += w * float(seen.count[q] - 1)
     n = float(seen.count[p])
     out.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
@@ -154,30 +154,32 @@ def _average(first: int, surfaces: Surfaces, seen: Observations, out: Layer) -> 
 
 
 @wp.func
-def _spread(seen: Observations, q: int) -> wp.vec2:
+def _spread(seen: SampleBuffer, q: int) -> wp.vec2:
     """Sums of the squared deviations from the means."""
-    sums = mean_channels(seen.direct[q], seen.indirect[q])
-    return wp.max(seen.squares[q] - wp.cw_mul(sums, sums) / float(seen.count[q]), wp.vec2(0.0))
+    sample_sums = mean_channels(seen.direct[q], seen.indirect[q])
+    return wp.max(seen.squares[q] - wp.cw_mul(sample_sums, sample_sums) / float(seen.count[q]), wp.vec2(0.0))
 
 
 _NO_SUMS = ("surfaces", "noise", "seed")
 
 
-def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed: int) -> tuple[Any, float]:
-    """`Observations` without samples yet, and the share of the pixels that lie beside another surface.
+def new_sample_buffer(
+    scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed: int
+) -> tuple[Any, float]:
+    """`SampleBuffer` without samples yet, and the share of the pixels that lie beside another surface.
 
     `gbuffer` is used as scratch, `seed` is that of the film.
     """
     pixels = camera.columns * camera.rows
-    surfaces = Surfaces()
+    surfaces = PixelSurfaces()
     surfaces.columns, surfaces.rows = camera.columns, camera.rows
     surfaces.position, surfaces.normal = launcher.zeros(pixels, wp.vec3), launcher.zeros(pixels, wp.vec3)
     surfaces.footprint = launcher.empty(pixels, wp.float32)
     surfaces.bordering = launcher.empty(pixels, wp.uint8)
     trace_primary(scene, camera, launcher, gbuffer, iteration=-1, seed=0)
-    launcher.launch(_look, pixels, [camera, gbuffer, surfaces])
+    launcher.launch(_store_pixel_surfaces, pixels, [camera, gbuffer, surfaces])
     launcher.launch(_find_edges, pixels, [surfaces])
-    seen = Observations()
+    seen = SampleBuffer()
     seen.surfaces = surfaces
     for name in ("direct", "indirect", "other_direct", "other_indirect"):
         setattr(seen, name, launcher.zeros(pixels, wp.vec3))
@@ -187,19 +189,19 @@ def look(scene: DeviceScene, camera: Any, launcher: Launcher, gbuffer: Any, seed
     return seen, float(surfaces.bordering.numpy().mean())
 
 
-def sums(seen: Any) -> dict[str, Any]:
-    """The samples of `Observations`, by name."""
-    return {name: getattr(seen, name) for name in Observations.vars if name not in _NO_SUMS}
+def sample_sums(seen: Any) -> dict[str, Any]:
+    """The samples of `SampleBuffer`, by name."""
+    return {name: getattr(seen, name) for name in SampleBuffer.vars if name not in _NO_SUMS}
 
 
-def observe(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher) -> None:
-    """Adds one iteration's samples of irradiance over π to `Observations`."""
-    launcher.launch(_observe, indices(gbuffer.tiles), [gbuffer, direct, indirect, seen])
+def accumulate(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher) -> None:
+    """Adds one iteration's samples of irradiance over π to `SampleBuffer`."""
+    launcher.launch(_accumulate_samples, indices(gbuffer.tiles), [gbuffer, direct, indirect, seen])
 
 
-def average(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
-    """Fills a `Layer` with the means of `Observations`, and gives these back with their `noise`, which it fills too."""
-    seen = copied(seen)
+def estimate_means(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
+    """Fills an `IrradianceLayer` with means; returns the `SampleBuffer` with `noise`, which it fills too."""
+    seen = copy_record(seen)
     seen.noise = noise
-    launcher.launch(_average, seen.count.shape[0], [seen.surfaces, seen, layer])
+    launcher.launch(_estimate_means, seen.count.shape[0], [seen.surfaces, seen, layer])
     return seen

@@ -37,10 +37,10 @@ class Grid:
 
 
 @wp.struct
-class GridTables:
+class Distribution2DTables:
     """All grids of a scene."""
 
-    grids: wp.array[Grid]
+    distributions: wp.array[Grid]
     cdf: wp.array[wp.float32]
     texels: wp.array[wp.vec3]
 
@@ -71,9 +71,9 @@ def _find(cdf: wp.array[wp.float32], first: int, count: int, u: float) -> int:
 
 
 @wp.func(inline=False)
-def sample_cell(tables: GridTables, index: int, u: wp.vec2) -> Cell:
+def sample_cell(tables: Distribution2DTables, index: int, u: wp.vec2) -> Cell:
     """A cell by its probability: u[1] chooses the row, u[0] the column."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     cell = Cell()
     cell.row = _find(tables.cdf, grid.cdf, grid.rows, u[1])
     low = tables.cdf[grid.cdf + cell.row]
@@ -89,7 +89,7 @@ def sample_cell(tables: GridTables, index: int, u: wp.vec2) -> Cell:
 
 
 @wp.func
-def _cell_probability(tables: GridTables, grid: Grid, row: int, column: int) -> float:
+def _cell_probability(tables: Distribution2DTables, grid: Grid, row: int, column: int) -> float:
     first = grid.cdf + grid.rows + 1 + row * (grid.columns + 1) + column
     of_row = tables.cdf[grid.cdf + row + 1] - tables.cdf[grid.cdf + row]
     return of_row * (tables.cdf[first + 1] - tables.cdf[first])
@@ -111,9 +111,9 @@ def _solid_angle(grid: Grid, row: int) -> float:
 
 
 @wp.func(inline=False)
-def cell_direction(tables: GridTables, index: int, cell: Cell) -> wp.vec4:
+def cell_direction(tables: Distribution2DTables, index: int, cell: Cell) -> wp.vec4:
     """The unit direction of a place in a cell, around +z, and its density per solid angle."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     step = grid.theta / float(grid.rows)
     h = wp.lerp(_versine(step * float(cell.row)), _versine(step * float(cell.row + 1)), cell.y)
     r = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
@@ -122,7 +122,7 @@ def cell_direction(tables: GridTables, index: int, cell: Cell) -> wp.vec4:
 
 
 @wp.func
-def direction_place(grid: Grid, d: wp.vec3) -> wp.vec2:
+def direction_uv(grid: Grid, d: wp.vec3) -> wp.vec2:
     """Column and row, with fractions, of a unit direction around +z."""
     theta = wp.atan2(wp.sqrt(d[0] * d[0] + d[1] * d[1]), d[2])
     phi = wp.atan2(d[1], d[0])
@@ -133,32 +133,32 @@ def direction_place(grid: Grid, d: wp.vec3) -> wp.vec2:
 
 
 @wp.func(inline=False)
-def direction_density(tables: GridTables, index: int, d: wp.vec3) -> float:
+def direction_pdf(tables: Distribution2DTables, index: int, d: wp.vec3) -> float:
     """The density per solid angle with which `cell_direction` gives a unit direction."""
-    grid = tables.grids[index]
-    place = direction_place(grid, d)
+    grid = tables.distributions[index]
+    place = direction_uv(grid, d)
     row = wp.clamp(int(place[1]), 0, grid.rows - 1)
     return _cell_probability(tables, grid, row, wp.clamp(int(place[0]), 0, grid.columns - 1)) / _solid_angle(grid, row)
 
 
 @wp.func(inline=False)
-def place_density(tables: GridTables, index: int, u: wp.vec2) -> float:
+def uv_pdf(tables: Distribution2DTables, index: int, u: wp.vec2) -> float:
     """The density of the samples at a place u in [0, 1]² of a rectangle, relative to uniform ones."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     row = wp.clamp(int(u[1] * float(grid.rows)), 0, grid.rows - 1)
     column = wp.clamp(int(u[0] * float(grid.columns)), 0, grid.columns - 1)
     return _cell_probability(tables, grid, row, column) * float(grid.rows) * float(grid.columns)
 
 
 @wp.func
-def cell_place(tables: GridTables, index: int, cell: Cell) -> wp.vec2:
+def cell_uv(tables: Distribution2DTables, index: int, cell: Cell) -> wp.vec2:
     """The place u in [0, 1]² of a rectangle."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     return wp.vec2((float(cell.column) + cell.x) / float(grid.columns), (float(cell.row) + cell.y) / float(grid.rows))
 
 
 @wp.func
-def _texel(tables: GridTables, grid: Grid, row: int, column: int) -> wp.vec3:
+def _texel(tables: Distribution2DTables, grid: Grid, row: int, column: int) -> wp.vec3:
     r = wp.clamp(row, 0, grid.rows - 1)
     c = wp.clamp(column, 0, grid.columns - 1)
     if grid.theta > 0.0:  # all the way round
@@ -167,9 +167,9 @@ def _texel(tables: GridTables, grid: Grid, row: int, column: int) -> wp.vec3:
 
 
 @wp.func(inline=False)
-def interpolate(tables: GridTables, index: int, place: wp.vec2) -> wp.vec3:
+def interpolate(tables: Distribution2DTables, index: int, place: wp.vec2) -> wp.vec3:
     """The value at a column and row with fractions, bilinear between the centres of cells."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     x = place[0] - 0.5
     y = place[1] - 0.5
     column = int(wp.floor(x))
@@ -182,16 +182,16 @@ def interpolate(tables: GridTables, index: int, place: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def value_at_place(tables: GridTables, index: int, u: wp.vec2) -> wp.vec3:
+def value_at_uv(tables: Distribution2DTables, index: int, u: wp.vec2) -> wp.vec3:
     """The value at a place u in [0, 1]² of a rectangle."""
-    grid = tables.grids[index]
+    grid = tables.distributions[index]
     return interpolate(tables, index, wp.vec2(u[0] * float(grid.columns), u[1] * float(grid.rows)))
 
 
 @wp.func
-def value_along(tables: GridTables, index: int, d: wp.vec3) -> wp.vec3:
+def value_along(tables: Distribution2DTables, index: int, d: wp.vec3) -> wp.vec3:
     """The value along a unit direction around +z."""
-    return interpolate(tables, index, direction_place(tables.grids[index], d))
+    return interpolate(tables, index, direction_uv(tables.distributions[index], d))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,10 +211,10 @@ class _Values:
         )
 
 
-class GridList:
+class Distribution2DList:
     """Grids on the host, to be uploaded together."""
 
-    def __init__(self, former: Sequence["GridList"] = ()) -> None:
+    def __init__(self, former: Sequence["Distribution2DList"] = ()) -> None:
         """An empty list; if it comes to equal one of `former` ones, that one's tables are taken."""
         self._former = former
         self._grids: list[_Values] = []
@@ -233,13 +233,13 @@ class GridList:
         return len(self._grids) - 1
 
     def upload(self, launcher: Launcher) -> Any:
-        """The `GridTables`; one unused row where there is nothing, since kernels never get a null pointer."""
+        """The `Distribution2DTables`; one unused row where there is nothing, since kernels never get a null pointer."""
         if self._tables is None:
             self._tables = next((f._tables for f in self._former if self._equals(f)), None) or self._upload(launcher)
             self._former = ()
         return self._tables
 
-    def _equals(self, other: "GridList") -> bool:
+    def _equals(self, other: "Distribution2DList") -> bool:
         return len(self._grids) == len(other._grids) and all(
             mine.equals(its) for mine, its in zip(self._grids, other._grids, strict=True)
         )
@@ -260,8 +260,8 @@ class GridList:
             if grid.keep:
                 texels.append(grid.values.reshape(-1, 3).astype(np.float32))
                 texels_length += rows * columns
-        out = GridTables()
-        out.grids = launcher.array(table, Grid)
+        out = Distribution2DTables()
+        out.distributions = launcher.array(table, Grid)
         out.cdf = launcher.array(np.concatenate(cdf), wp.float32)
         out.texels = launcher.array(np.concatenate(texels) if texels_length else np.zeros((1, 3)), wp.vec3)
         return out

@@ -28,7 +28,7 @@ class Aim:
     """A sampled way from a point to a light."""
 
     way: wp.vec3  # to where the light emits towards the point
-    density: float  # of its direction, per solid angle; 0: nothing arrives this way
+    pdf: float  # of its direction, per solid angle; 0: nothing arrives this way
 
 
 @wp.struct
@@ -64,7 +64,7 @@ def _space(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3) -> _
 
 
 @wp.func(inline=False)
-def aim_at(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, u: wp.vec2) -> Aim:
+def sample_solid_angle(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, u: wp.vec2) -> Aim:
     """A random way to a light.
 
     Args:
@@ -77,33 +77,33 @@ def aim_at(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, u: w
     space = _space(kind, axes, inverse, to_light)
     found = Aim()
     if kind == _RECT or kind == _DISK:
-        found = _aim_at_flat(kind, space, u)
+        found = _sample_flat(kind, space, u)
     elif kind == _SPHERE:
-        found = _aim_at_sphere(space.centre, u)
+        found = _sample_sphere(space.centre, u)
     else:
-        found = _aim_at_cylinder(space, u)
-    if found.density > 0.0:
+        found = _sample_cylinder(space, u)
+    if found.pdf > 0.0:
         p = found.way
         found.way = axes * wp.cw_div(p, space.scale)
         stretched = wp.length(found.way) / (wp.length(p) * space.volume_root)
-        found.density *= stretched * stretched * stretched
+        found.pdf *= stretched * stretched * stretched
     return found
 
 
 @wp.func(inline=False)
-def aim_density(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, direction: wp.vec3) -> float:
-    """The density with which `aim_at` gives a unit direction that meets the emitting side of the light."""
+def solid_angle_pdf(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, direction: wp.vec3) -> float:
+    """The density with which `sample_solid_angle` gives a unit direction that meets the emitting side of the light."""
     space = _space(kind, axes, inverse, to_light)
     d = wp.cw_mul(space.scale, inverse * direction)
-    density = float(0.0)
+    pdf = float(0.0)
     if kind == _RECT or kind == _DISK:
-        density = _flat_density(kind, space, d)
+        pdf = _flat_pdf(kind, space, d)
     elif kind == _SPHERE:
-        density = _sphere_density(space.centre)
+        pdf = _sphere_pdf(space.centre)
     else:
-        density = _cylinder_density(space, d)
+        pdf = _cylinder_pdf(space, d)
     stretched = 1.0 / (wp.length(d) * space.volume_root)
-    return density * stretched * stretched * stretched
+    return pdf * stretched * stretched * stretched
 
 
 @wp.func
@@ -114,7 +114,7 @@ def _one_minus_cos(centre: wp.vec3) -> float:
 
 
 @wp.func
-def _aim_at_sphere(centre: wp.vec3, u: wp.vec2) -> Aim:
+def _sample_sphere(centre: wp.vec3, u: wp.vec2) -> Aim:
     out = Aim()
     squared = wp.dot(centre, centre)
     if not squared > 1.0:
@@ -129,12 +129,12 @@ def _aim_at_sphere(centre: wp.vec3, u: wp.vec2) -> Aim:
     phi = 2.0 * wp.pi * u[1]
     around = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h)
     out.way = t * from_local(around, centre / distance)
-    out.density = 1.0 / (2.0 * wp.pi * whole)
+    out.pdf = 1.0 / (2.0 * wp.pi * whole)
     return out
 
 
 @wp.func
-def _sphere_density(centre: wp.vec3) -> float:
+def _sphere_pdf(centre: wp.vec3) -> float:
     if not wp.dot(centre, centre) > 1.0:
         return 0.0
     return 1.0 / (2.0 * wp.pi * _one_minus_cos(centre))
@@ -174,7 +174,7 @@ def _area(kind: int, half: wp.vec2) -> float:
 
 
 @wp.func
-def _aim_at_flat(kind: int, space: _Space, u: wp.vec2) -> Aim:
+def _sample_flat(kind: int, space: _Space, u: wp.vec2) -> Aim:
     out = Aim()
     z = -space.centre[2]  # the light shines along +z
     if not z > 0.0:
@@ -190,13 +190,13 @@ def _aim_at_flat(kind: int, space: _Space, u: wp.vec2) -> Aim:
         p = _in_rectangle(low, high, z, angle, u)
         out.way = wp.vec3(p[0], p[1], -z)
         if kind == _RECT or wp.length_sq(p - centre) <= 1.0:
-            out.density = 1.0 / angle
+            out.pdf = 1.0 / angle
         return out
     p = wp.vec2(wp.lerp(low[0], high[0], u[0]), wp.lerp(low[1], high[1], u[1]))
     if kind == _DISK:
         p = centre + square_to_disk(u)
     out.way = wp.vec3(p[0], p[1], -z)
-    out.density = _per_area(out.way, _area(kind, half))
+    out.pdf = _per_area(out.way, _area(kind, half))
     return out
 
 
@@ -208,7 +208,7 @@ def _per_area(way: wp.vec3, area: float) -> float:
 
 
 @wp.func
-def _flat_density(kind: int, space: _Space, d: wp.vec3) -> float:
+def _flat_pdf(kind: int, space: _Space, d: wp.vec3) -> float:
     z = -space.centre[2]
     if not (z > 0.0 and d[2] < 0.0):
         return 0.0
@@ -267,7 +267,7 @@ def _half_width(centre: wp.vec3) -> float:
 
 
 @wp.func
-def _aim_at_cylinder(space: _Space, u: wp.vec2) -> Aim:
+def _sample_cylinder(space: _Space, u: wp.vec2) -> Aim:
     out = Aim()
     centre = space.centre
     half = _half_width(centre)
@@ -285,12 +285,12 @@ def _aim_at_cylinder(space: _Space, u: wp.vec2) -> Aim:
     h = x0 / wp.sqrt(x0 * x0 + distance * distance) + u[1] * sines
     x = wp.clamp(h * distance / wp.sqrt(wp.max(1.0 - h * h, 1.0e-30)), x0, x1)
     out.way = wp.vec3(x, distance * e[0], distance * e[1])
-    out.density = 1.0 / (2.0 * half * sines)
+    out.pdf = 1.0 / (2.0 * half * sines)
     return out
 
 
 @wp.func
-def _cylinder_density(space: _Space, d: wp.vec3) -> float:
+def _cylinder_pdf(space: _Space, d: wp.vec3) -> float:
     half = _half_width(space.centre)
     if half == 0.0:
         return 0.0

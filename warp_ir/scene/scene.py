@@ -78,7 +78,9 @@ class Scene:
             if group is None:
                 by_material = areas_by_material(mesh)
                 total += float(by_material.sum())
-                reflected += float(by_material @ albedo[: len(by_material)]) if mesh.colors is None else colored_area(mesh)
+                reflected += (
+                    float(by_material @ albedo[: len(by_material)]) if mesh.colors is None else colored_area(mesh)
+                )
                 continue
             area = triangle_areas(mesh)
             rho = albedo[mesh.material] if mesh.colors is None else mesh.colors.mean(axis=(1, 2))

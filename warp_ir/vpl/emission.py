@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import MOST_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.lights import Aim, emit, land, sample_light
+from warp_ir.lights import PhotonTarget, emit_photon, first_reflection, sample_light
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.surface import albedo, closest, scene_at
-from warp_ir.vpl.guide import Guide, Worth, kept_probability
+from warp_ir.vpl.guide import Guide, VplImportance, survival_probability
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -36,13 +36,13 @@ _MAX_REFLECTIVITY = 0.98
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
 _KEEPING = wp.constant(wp.uint32(0x9E6C63D0))  # parts the coins by which VPLs are kept from the paths' sequence
-_FOLLOWED_AGAIN = 0.02
+_RETRACED_SHARE = 0.02
 """About the share of the paths that may be longer than what is noted of them."""
-_MOST_NOTED = 2**22
+_MAX_RECORDED = 2**22
 """Reflections noted at most, 48 bytes each."""
-_ROOM = 8
+_CAPACITY_PER_PATH = 8
 """VPLs on surfaces for which there is room, per path at least: the mean where 8/9 of the light is reflected."""
-_MOST_ROOM = 2**26
+_MAX_CAPACITY = 2**26
 """VPLs on surfaces at most, 64 bytes each."""
 _THINNING = wp.constant(wp.uint32(0x7FEB352D))  # parts the choice of those that find room from the paths' sequence
 
@@ -56,14 +56,14 @@ class VplBuffer:
     """
 
     count: wp.array[wp.int32]  # one row
-    room: int  # at least `count`; the same on the CPU, where reading it costs nothing
+    capacity: int  # at least `count`; the same on the CPU, where reading it costs nothing
     on_lights: int
     position: wp.array[wp.vec4]
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]
-    density: wp.array[wp.float32]  # [on_lights], of samples per area of the light; 0 where it has no area
-    control: wp.array[wp.int32]  # [on_lights], rows of the lights' `LightControl`s or -1; one row if there are none
+    pdf_area: wp.array[wp.float32]  # [on_lights], of samples per area of the light; 0 where it has no area
+    modifiers: wp.array[wp.int32]  # [on_lights], rows of the lights' `LightModifiers`s or -1; one row if there are none
 
 
 @wp.struct
@@ -77,14 +77,14 @@ class PathSettings:
     fractional: int  # 1: the first survivors[j] paths are reflected j times; 0: roulette by the local albedo
     survivors: wp.array[wp.int32]
     levels: int  # length of survivors
-    noted: int  # VPLs of a path that are noted while it is traced
-    room: int  # for VPLs on surfaces; if there are more, some are drawn to stand for all
-    aim: Aim
-    worth: Worth
+    recorded: int  # VPLs of a path that are noted while it is traced
+    capacity: int  # for VPLs on surfaces; if there are more, some are drawn to stand for all
+    photon_target: PhotonTarget
+    importance: VplImportance
 
 
 @wp.func
-def _coin(scramble: wp.uint32, path: int, bounce: int) -> float:
+def _survival_sample(scramble: wp.uint32, path: int, bounce: int) -> float:
     """Uniform in [0, 1), for every VPL."""
     bits = sobol.hash_combine(sobol.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
     return sobol.to_unit(bits)
@@ -96,20 +96,20 @@ def _row(settings: PathSettings, number: int, total: int) -> int:
 
     Those that are kept lie evenly among the others, and each is kept with the same probability (systematic sampling).
     """
-    if total <= settings.room:
+    if total <= settings.capacity:
         return settings.on_lights + number
     offset = sobol.hash_combine(settings.scramble ^ _THINNING, wp.uint32(0)) % wp.uint32(total)
-    before = (wp.int64(number) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
-    after = (wp.int64(number + 1) * wp.int64(settings.room) + wp.int64(offset)) // wp.int64(total)
+    before = (wp.int64(number) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
+    after = (wp.int64(number + 1) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     return wp.where(after > before, settings.on_lights + int(before), -1)
 
 
 @wp.func
-def _stands_for(settings: PathSettings, total: int) -> float:
+def _thinning_weight(settings: PathSettings, total: int) -> float:
     """How many of `total` VPLs each of those stands for that are kept."""
-    if total <= settings.room:
+    if total <= settings.capacity:
         return 1.0
-    return float(total) / float(settings.room)
+    return float(total) / float(settings.capacity)
 
 
 @wp.func(inline=False)
@@ -139,14 +139,14 @@ def _follow(
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
         vpls.bounce[i] = 0
-        vpls.density[i] = scene.emitter_density[light.emitter]
-        if scene.control_count > 0:
-            vpls.control[i] = light.control
+        vpls.pdf_area[i] = scene.emitter_pdf_area[light.emitter]
+        if scene.modifier_count > 0:
+            vpls.modifiers[i] = light.modifiers
 
-    photon = emit(
+    photon = emit_photon(
         scene,
         light,
-        settings.aim,
+        settings.photon_target,
         sobol.sample_2d(scene.sobol, i, 3, settings.scramble),
         sobol.sample_2d(scene.sobol, i, 5, settings.scramble),
     )
@@ -158,9 +158,9 @@ def _follow(
     left = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
-        if bounce == 1 and light.control >= 0:
+        if bounce == 1 and light.modifiers >= 0:
             coin = sobol.sample_1d(scene.sobol, i, _LANDING_DIMENSION, settings.scramble)
-            landing = land(scene, light.control, hit, direction, coin)
+            landing = first_reflection(scene, light.modifiers, hit, direction, coin)
             hit = landing.hit
             flux = flux * landing.weight
         if hit.triangle < 0:
@@ -180,10 +180,10 @@ def _follow(
             break
         intensity = flux * (share / wp.pi)
         survives = bool(True)
-        if settings.worth.known == 1:
-            probability = kept_probability(settings.worth, hit.position, hit.normal, intensity)
+        if settings.importance.known == 1:
+            probability = survival_probability(settings.importance, hit.position, hit.normal, intensity)
             intensity = intensity / probability
-            survives = _coin(settings.scramble, i, bounce) < probability
+            survives = _survival_sample(settings.scramble, i, bounce) < probability
         if survives:
             left += 1
             if left > kept and left <= most:
@@ -191,7 +191,7 @@ def _follow(
                 if row >= 0:
                     vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-                    vpls.intensity[row] = intensity * _stands_for(settings, total)
+                    vpls.intensity[row] = intensity * _thinning_weight(settings, total)
                     vpls.bounce[row] = bounce
         origin = hit.position
         u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
@@ -201,24 +201,24 @@ def _follow(
     return left
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_paths(
     first: int, scene: SceneData, settings: PathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
 ) -> None:
     """Follows path `i` and notes its light and its first VPLs on surfaces, those of all paths side by side."""
     i = first + wp.tid()
-    lengths[i] = _follow(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.noted)
+    lengths[i] = _follow(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.recorded)
 
 
 @wp.func
-def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, stands_for: float) -> None:
+def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weight: float) -> None:
     target.position[to] = source.position[row]
     target.normal[to] = source.normal[row]
-    target.intensity[to] = source.intensity[row] * stands_for
+    target.intensity[to] = source.intensity[row] * thinning_weight
     target.bounce[to] = source.bounce[row]
 
 
-@wp.kernel(cuda_max_registers=MOST_REGISTERS)
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _store_paths(
     first: int,
     scene: SceneData,
@@ -233,19 +233,19 @@ def _store_paths(
     i = first + wp.tid()
     total = ends[settings.paths - 1]
     number = ends[i] - lengths[i]
-    for k in range(wp.min(lengths[i], settings.noted)):
+    for k in range(wp.min(lengths[i], settings.recorded)):
         row = _row(settings, number + k, total)
         if row >= 0:
-            _copy(traced, settings.on_lights + settings.paths * k + i, vpls, row, _stands_for(settings, total))
+            _copy(traced, settings.on_lights + settings.paths * k + i, vpls, row, _thinning_weight(settings, total))
     if i < settings.on_lights:
         _copy(traced, i, vpls, i, 1.0)
-        vpls.density[i] = traced.density[i]
-        if scene.control_count > 0:
-            vpls.control[i] = traced.control[i]
-    if lengths[i] > settings.noted:
-        _follow(scene.address, settings, i, vpls, number, 1, total, settings.noted, lengths[i])
+        vpls.pdf_area[i] = traced.pdf_area[i]
+        if scene.modifier_count > 0:
+            vpls.modifiers[i] = traced.modifiers[i]
+    if lengths[i] > settings.recorded:
+        _follow(scene.address, settings, i, vpls, number, 1, total, settings.recorded, lengths[i])
     if i == settings.paths - 1:
-        vpls.count[0] = settings.on_lights + wp.min(total, settings.room)
+        vpls.count[0] = settings.on_lights + wp.min(total, settings.capacity)
         counted[0] += wp.int64(vpls.count[0])
 
 
@@ -290,47 +290,47 @@ def emit_vpls(
     settings.scramble = wp.uint32(scramble)
     paths *= guide.paths
     settings.paths, settings.on_lights = paths, on_lights
-    settings.aim, settings.worth = guide.aim, guide.worth
+    settings.photon_target, settings.importance = guide.photon_target, guide.importance
     settings.max_bounces = max_bounces
-    settings.survivors = launcher.kept("survivors", 1, wp.int32)
+    settings.survivors = launcher.scratch("survivors", 1, wp.int32)
     if absorption == "fractional":
         alive = survivors(paths, scene.mean_albedo)
         settings.fractional, settings.levels = 1, len(alive)
-        settings.survivors = launcher.table("survivors", alive, wp.int32)
-    noted = _noted(paths, scene.mean_albedo)
-    settings.noted = min(noted, max_bounces)
-    settings.room = min(paths * min(max(noted, _ROOM), max_bounces), _MOST_ROOM)
+        settings.survivors = launcher.cached_upload("survivors", alive, wp.int32)
+    recorded = _recorded_length(paths, scene.mean_albedo)
+    settings.recorded = min(recorded, max_bounces)
+    settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
     # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
-    lengths, ends = launcher.kept("lengths", paths, wp.int32), launcher.kept("ends", paths, wp.int32)
-    traced = _buffer(scene, launcher, "traced", on_lights, paths * settings.noted)
+    lengths, ends = launcher.scratch("lengths", paths, wp.int32), launcher.scratch("ends", paths, wp.int32)
+    traced = _buffer(scene, launcher, "traced", on_lights, paths * settings.recorded)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
-    vpls = _buffer(scene, launcher, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.room))
+    vpls = _buffer(scene, launcher, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
     launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
     return vpls
 
 
-def _noted(paths: int, mean_albedo: float) -> int:
+def _recorded_length(paths: int, mean_albedo: float) -> int:
     """Reflections to note of every path: few paths go on after them, which then have to be followed again."""
     rho = min(max(mean_albedo, 0.05), 0.95)
-    return max(min(math.ceil(math.log(_FOLLOWED_AGAIN) / math.log(rho)), _MOST_NOTED // paths), 1)
+    return max(min(math.ceil(math.log(_RETRACED_SHARE) / math.log(rho)), _MAX_RECORDED // paths), 1)
 
 
 def _buffer(scene: DeviceScene, launcher: Launcher, name: str, on_lights: int, on_surfaces: int) -> Any:
     vpls = VplBuffer()
-    vpls.on_lights, vpls.room = on_lights, on_lights + on_surfaces
-    vpls.count = launcher.kept(name + ".count", 1, wp.int32)
-    rows = max(vpls.room, 1)
-    vpls.position = launcher.kept(name + ".position", rows, wp.vec4)
-    vpls.normal = launcher.kept(name + ".normal", rows, wp.vec4)
-    vpls.intensity = launcher.kept(name + ".intensity", rows, wp.vec3)
-    vpls.bounce = launcher.kept(name + ".bounce", rows, wp.int32)
-    vpls.density = launcher.kept(name + ".density", max(on_lights, 1), wp.float32)
-    controls = max(on_lights, 1) if scene.data.control_count > 0 else 1
-    vpls.control = launcher.kept(name + ".control", controls, wp.int32)
+    vpls.on_lights, vpls.capacity = on_lights, on_lights + on_surfaces
+    vpls.count = launcher.scratch(name + ".count", 1, wp.int32)
+    rows = max(vpls.capacity, 1)
+    vpls.position = launcher.scratch(name + ".position", rows, wp.vec4)
+    vpls.normal = launcher.scratch(name + ".normal", rows, wp.vec4)
+    vpls.intensity = launcher.scratch(name + ".intensity", rows, wp.vec3)
+    vpls.bounce = launcher.scratch(name + ".bounce", rows, wp.int32)
+    vpls.pdf_area = launcher.scratch(name + ".density", max(on_lights, 1), wp.float32)
+    modifiers = max(on_lights, 1) if scene.data.modifier_count > 0 else 1
+    vpls.modifiers = launcher.scratch(name + ".control", modifiers, wp.int32)
     return vpls
 
 

@@ -15,8 +15,8 @@ import warp as wp
 
 from warp_ir.bvh import on_cuda
 from warp_ir.device_scene import SceneData
-from warp_ir.light_modifiers import emphasis
-from warp_ir.lights import arriving
+from warp_ir.light_modifiers import approximate_shaping
+from warp_ir.lights import light_visibility
 from warp_ir.surface import scene_at
 from warp_ir.vpl.sets import BLOCK_ROWS, LANES, SHAPING_ROWS, VplSets, bound_of, color_of, luminance, vec16, vec16i
 
@@ -27,18 +27,18 @@ _MOST_RAYS = wp.constant(8)
 
 
 @wp.struct
-class Receiver:
+class ShadingPoint:
     """A surface point that gathers."""
 
     position: wp.vec3
     normal: wp.vec3  # geometric
     shading_normal: wp.vec3
     mesh: int
-    seen: bool  # by the camera
+    from_camera: bool  # by the camera
 
 
 @wp.func
-def bounded_geometry_term(x: Receiver, position: wp.vec4, normal: wp.vec4, bound: float) -> float:
+def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, bound: float) -> float:
     """min(G, bound) between a receiver and a VPL; 0 behind the surface, whatever its interpolated normal says."""
     to_vpl = wp.vec3(position[0], position[1], position[2]) - x.position * position[3]
     squared = wp.dot(to_vpl, to_vpl) + 1.0e-30
@@ -70,7 +70,7 @@ def bounded_geometry_term(x: Receiver, position: wp.vec4, normal: wp.vec4, bound
     }
     return f;
 """)
-def _weigh(rows: wp.array[vec16], first: int, x: Receiver) -> vec16:
+def _weigh(rows: wp.array[vec16], first: int, x: ShadingPoint) -> vec16:
     """Luminance of f for the sixteen VPLs of a block: `bounded_geometry_term` in lanes, without a branch."""
     ...
 
@@ -91,16 +91,18 @@ def _weigh(rows: wp.array[vec16], first: int, x: Receiver) -> vec16:
     }
     return out;
 """)
-def _emphasize(rows: wp.array[vec16], first: int, shapes: wp.array[vec16], first_shape: int, x: Receiver) -> vec16:
+def _block_shaping(
+    rows: wp.array[vec16], first: int, shapes: wp.array[vec16], first_shape: int, x: ShadingPoint
+) -> vec16:
     """What shaping makes of the weights of a block."""
     ...
 
 
 @wp.func
-def _weigh_block(lit: VplSets, block: int, x: Receiver) -> vec16:
+def _block_weights(lit: VplSets, block: int, x: ShadingPoint) -> vec16:
     f = _weigh(lit.rows, BLOCK_ROWS * block, x)
     if lit.shaped == 1:
-        f = wp.cw_mul(f, _emphasize(lit.rows, BLOCK_ROWS * block, lit.shapes, SHAPING_ROWS * block, x))
+        f = wp.cw_mul(f, _block_shaping(lit.rows, BLOCK_ROWS * block, lit.shapes, SHAPING_ROWS * block, x))
     return f
 
 
@@ -141,20 +143,27 @@ def _sum(v: vec16) -> float: ...
 
 
 @wp.func
-def _shadowed(
-    scene: SceneData, lit: VplSets, x: Receiver, slot: int, position: wp.vec4, color: wp.vec4, share: float, most: int
+def _shadowed_contribution(
+    scene: SceneData,
+    lit: VplSets,
+    x: ShadingPoint,
+    slot: int,
+    position: wp.vec4,
+    color: wp.vec4,
+    share: float,
+    most: int,
 ) -> wp.vec3:
     """What the chosen VPL gives: `share` (= S/M) in its `color`, if it is visible and of at most `most` bounces."""
     if int(color[3]) > most:
         return wp.vec3(0.0)
-    control = int(-1)
-    if scene.control_count > 0:
+    modifiers = int(-1)
+    if scene.modifier_count > 0:
         vpl = lit.order[slot]
         if vpl < lit.vpls.on_lights:
-            control = lit.vpls.control[vpl]
-    arrives = arriving(scene, control, x.position, x.mesh, x.seen, position)
-    if control >= 0:  # it was weighed with this factor
-        arrives = arrives / emphasis(scene.light_tables[0].controls.rows[control], x.position, position)
+            modifiers = lit.vpls.modifiers[vpl]
+    arrives = light_visibility(scene, modifiers, x.position, x.mesh, x.from_camera, position)
+    if modifiers >= 0:  # it was weighed with this factor
+        arrives = arrives / approximate_shaping(scene.light_tables[0].modifiers.rows[modifiers], x.position, position)
     intensity = wp.vec3(color[0], color[1], color[2])
     return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
 
@@ -165,7 +174,7 @@ def gather(
     parts: wp.array[VplSets],
     part: int,
     which: float,
-    x: Receiver,
+    x: ShadingPoint,
     u: float,
     rays: int,
     max_bounce: int,
@@ -186,14 +195,14 @@ def gather(
 
 @wp.func
 def _gather_in_blocks(
-    scene: SceneData, lit: VplSets, chosen: int, x: Receiver, u: float, rays: int, max_bounce: int
+    scene: SceneData, lit: VplSets, chosen: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
     """Every lane is a part of the set's curve; the M targets lie along one lane after the other."""
     out = wp.vec3(0.0)
     begin = chosen * lit.blocks
     sums = vec16()
     for block in range(begin, begin + lit.blocks):
-        sums += _weigh_block(lit, block, x)
+        sums += _block_weights(lit, block, x)
     total = _sum(sums)
     if total <= 0.0:
         return out
@@ -203,7 +212,7 @@ def _gather_in_blocks(
     running = vec16()
     count = vec16i()
     for block in range(begin, begin + lit.blocks):
-        running += _weigh_block(lit, block, x)
+        running += _block_weights(lit, block, x)
         count = _count_below(running, target, count)
     passed = float(0.0)
     drawn = int(0)
@@ -219,7 +228,7 @@ def _gather_in_blocks(
                 p = wp.vec4(
                     lit.rows[row][lane], lit.rows[row + 1][lane], lit.rows[row + 2][lane], lit.rows[row + 3][lane]
                 )
-                out += _shadowed(scene, lit, x, slot, p, lit.colors[slot], share, max_bounce)
+                out += _shadowed_contribution(scene, lit, x, slot, p, lit.colors[slot], share, max_bounce)
             goal += share
             drawn += 1
         passed += sums[lane]
@@ -227,12 +236,12 @@ def _gather_in_blocks(
 
 
 @wp.func
-def _count_in_lane(lit: VplSets, begin: int, lane: int, x: Receiver, target: float) -> int:
+def _count_in_lane(lit: VplSets, begin: int, lane: int, x: ShadingPoint, target: float) -> int:
     """VPLs of a lane before its running sum passes a target."""
     running = float(0.0)
     k = int(0)
     while k < lit.blocks:
-        running += _weigh_block(lit, begin + k, x)[lane]
+        running += _block_weights(lit, begin + k, x)[lane]
         if running > target:
             break
         k += 1
@@ -241,7 +250,7 @@ def _count_in_lane(lit: VplSets, begin: int, lane: int, x: Receiver, target: flo
 
 @wp.func
 def _gather_one_by_one(
-    scene: SceneData, lit: VplSets, chosen: int, x: Receiver, u: float, rays: int, max_bounce: int
+    scene: SceneData, lit: VplSets, chosen: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
     """The same for a thread without lanes: one running sum, M targets along it.
 
@@ -252,7 +261,7 @@ def _gather_one_by_one(
     end = wp.min(begin + lit.blocks * _LANES, lit.count)
     total = float(0.0)
     for slot in range(begin, end):
-        total += _weigh_one(scene, lit, x, slot)
+        total += _vpl_weight(scene, lit, x, slot)
     if total <= 0.0:
         return out
     share = total / float(rays)
@@ -260,38 +269,40 @@ def _gather_one_by_one(
     drawn = int(0)
     slots = wp.zeros(shape=_MOST_RAYS, dtype=wp.int32)
     for slot in range(begin, end):
-        running += _weigh_one(scene, lit, x, slot)
+        running += _vpl_weight(scene, lit, x, slot)
         while drawn < rays and (float(drawn) + u) * share < running:
             slots[drawn] = slot
             drawn += 1
     for k in range(drawn):
         slot = slots[k]
         position = lit.vpls.position[lit.order[slot]]
-        out += _shadowed(scene, lit, x, slot, position, color_of(lit, slot), share, max_bounce)
+        out += _shadowed_contribution(scene, lit, x, slot, position, color_of(lit, slot), share, max_bounce)
     return out
 
 
 @wp.func
-def _weigh_one(scene: SceneData, lit: VplSets, x: Receiver, slot: int) -> float:
+def _vpl_weight(scene: SceneData, lit: VplSets, x: ShadingPoint, slot: int) -> float:
     vpl = lit.order[slot]
     normal = lit.vpls.normal[vpl]
     bound = bound_of(lit, vpl, normal)
     weight = luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
     if lit.shaped == 1 and weight > 0.0:
-        weight *= _emphasis_of(scene, lit, vpl, x.position)
+        weight *= _vpl_shaping(scene, lit, vpl, x.position)
     return weight
 
 
 @wp.func
-def _emphasis_of(scene: SceneData, lit: VplSets, vpl: int, position: wp.vec3) -> float:
+def _vpl_shaping(scene: SceneData, lit: VplSets, vpl: int, position: wp.vec3) -> float:
     """The same for one VPL on a light."""
-    row = lit.vpls.control[vpl]
+    row = lit.vpls.modifiers[vpl]
     if row < 0:
         return 1.0
-    control = scene.light_tables[0].controls.rows[row]
+    modifiers = scene.light_tables[0].modifiers.rows[row]
     target = lit.vpls.position[vpl]
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
-    cosine = -wp.dot(wp.vec3(control.frame[2, 0], control.frame[2, 1], control.frame[2, 2]), wp.normalize(to_light))
-    if cosine < control.cutoff:
+    cosine = -wp.dot(
+        wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2]), wp.normalize(to_light)
+    )
+    if cosine < modifiers.cutoff:
         return 0.0
-    return emphasis(control, position, target)
+    return approximate_shaping(modifiers, position, target)

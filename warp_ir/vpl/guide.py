@@ -3,9 +3,10 @@
 A `Guide` is three probabilities, whose inverses are weights: whatever they are, the light is the same on the mean.
 
 * Emitters are chosen by what they give to the picture: tables of the scene, in `Guide.scene`.
-* Photons from far away pass close by what they light: `lights.Aim`.
+* Photons from far away pass close by what they light: `lights.PhotonTarget`.
 * VPLs that give little to the picture are dropped at random, and those that are kept shine for them (Georgiev and
-  Slusallek 2010). What a VPL gives is its intensity times the `Worth` of the cell of space and direction that it is in.
+  Slusallek 2010). What a VPL gives is its intensity times the
+  `VplImportance` of the cell of space and direction that it is in.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.lights import Aim
+from warp_ir.lights import PhotonTarget
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,13 +25,13 @@ CELLS = 32
 _CELLS = wp.constant(CELLS)
 SIDES = 6
 """Directions of the normal."""
-LEAST_KEPT = 0.2
+MIN_SURVIVAL = 0.2
 """Probability with which the most useless VPL is kept: no weight is more than five times as large."""
-_LEAST_KEPT = wp.constant(LEAST_KEPT)
+_MIN_SURVIVAL = wp.constant(MIN_SURVIVAL)
 
 
 @wp.struct
-class Worth:
+class VplImportance:
     """What VPLs on surfaces give to the picture."""
 
     known: int  # 0: it is not; all VPLs are kept
@@ -53,10 +54,12 @@ def cell_of(position: wp.vec3, normal: wp.vec3, extent: float) -> int:
 
 
 @wp.func
-def kept_probability(worth: Worth, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3) -> float:
+def survival_probability(importance: VplImportance, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3) -> float:
     """With which a VPL is kept."""
-    gives = worth.per_intensity[cell_of(position, normal, worth.extent)] * (intensity[0] + intensity[1] + intensity[2])
-    return wp.clamp(gives, _LEAST_KEPT, 1.0)
+    gives = importance.per_intensity[cell_of(position, normal, importance.extent)] * (
+        intensity[0] + intensity[1] + intensity[2]
+    )
+    return wp.clamp(gives, _MIN_SURVIVAL, 1.0)
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,10 @@ class Guide:
 
     scene: DeviceScene
     """The scene; its emitters are chosen with the probabilities that pay."""
-    aim: Any
-    """The `Aim` of photons from far away."""
-    worth: Any
-    """The `Worth` of VPLs."""
+    photon_target: Any
+    """The `PhotonTarget` of photons from far away."""
+    importance: Any
+    """The `VplImportance` of VPLs."""
     paths: int = 1
     """Light paths to start for each that is asked for, to make up for what is dropped."""
     density: float = 1.0
@@ -77,7 +80,10 @@ class Guide:
 
 def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
     """Light paths begin in proportion to power, and all VPLs are kept."""
-    aim, worth = Aim(), Worth()
-    aim.focus, aim.cdf = launcher.kept("no.focus", 1, wp.vec4), launcher.kept("no.cdf", 1, wp.float32)
-    worth.per_intensity = launcher.kept("no.worth", 1, wp.float32)
-    return Guide(scene, aim, worth)
+    photon_target, importance = PhotonTarget(), VplImportance()
+    photon_target.focus, photon_target.cdf = (
+        launcher.scratch("no.focus", 1, wp.vec4),
+        launcher.scratch("no.cdf", 1, wp.float32),
+    )
+    importance.per_intensity = launcher.scratch("no.worth", 1, wp.float32)
+    return Guide(scene, photon_target, importance)

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import SceneData
-from warp_ir.lights import Bound, bound_on
+from warp_ir.lights import Bound, bound_for_pdf
 from warp_ir.vpl.emission import VplBuffer
 from warp_ir.vpl.guide import Guide
 
@@ -32,7 +32,7 @@ _AREAS = wp.constant(wp.float64(20.0))
 by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
 
 ON_LIGHTS, ON_SURFACES = wp.constant(0), wp.constant(1)
-"""The rows of what `arrange` returns."""
+"""The rows of what `build_sets` returns."""
 
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -44,7 +44,7 @@ class VplSets:
 
     Ten rows per block: x, y, z, w of the position, x, y, z, a of the normal, luminance, bound on G. If the VPLs lie on
     lights and any is shaped, seven more in a table of their own: x, y, z of its axis, and slope, offset, least value
-    and end of the ramp by which its VPLs are weighed (`light_control.emphasis`).
+    and end of the ramp by which its VPLs are weighed (`light_modifiers.approximate_shaping`).
     """
 
     sets: int  # this and what follows from the number of VPLs is known on the device alone
@@ -71,7 +71,7 @@ def bound_of(lit: VplSets, vpl: int, normal: wp.vec4) -> float:
     if normal[3] == 1.0:
         return UNBOUNDED
     if vpl < lit.vpls.on_lights:
-        return bound_on(lit.bound, lit.vpls.density[vpl])
+        return bound_for_pdf(lit.bound, lit.vpls.pdf_area[vpl])
     return lit.bound.least
 
 
@@ -113,12 +113,12 @@ def _with(lit: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
 
 @wp.func
 def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
-    """The bound where a pixel weighs so many VPLs, so many of them on lights; `arrange` knows the rest."""
+    """The bound where a pixel weighs so many VPLs, so many of them on lights; `build_sets` knows the rest."""
     out = Bound()
     out.least = UNBOUNDED
     if area > wp.float64(0.0):
         out.least = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
-    out.per_density = float(_PI * wp.float64(on_lights) / _AREAS)
+    out.per_pdf_area = float(_PI * wp.float64(on_lights) / _AREAS)
     return out
 
 
@@ -205,18 +205,18 @@ def _pack_shaping(first: int, scene: SceneData, parts: wp.array[VplSets]) -> Non
         axis = wp.vec3(0.0)
         ramp = wp.vec4(0.0, 1.0, 1.0, -2.0)  # level: not shaped
         if slot < lit.count:
-            row = lit.vpls.control[lit.order[slot]]
+            row = lit.vpls.modifiers[lit.order[slot]]
             if row >= 0:
-                control = scene.light_tables[0].controls.rows[row]
-                axis = wp.vec3(control.frame[2, 0], control.frame[2, 1], control.frame[2, 2])
-                ramp = wp.vec4(control.slope, control.offset, control.least, control.cutoff)
+                modifiers = scene.light_tables[0].modifiers.rows[row]
+                axis = wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2])
+                ramp = wp.vec4(modifiers.slope, modifiers.offset, modifiers.least, modifiers.cutoff)
         for k in range(3):
             lit.shapes[SHAPING_ROWS * i + k][lane] = axis[k]
         for k in range(4):
             lit.shapes[SHAPING_ROWS * i + 3 + k][lane] = ramp[k]
 
 
-def arrange(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
+def build_sets(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
     """The `VplSets` of the VPLs on lights and of those on surfaces: two rows.
 
     The area of the scene's surfaces, the number of VPLs that a pixel weighs and how densely the guide puts them give
@@ -226,25 +226,25 @@ def arrange(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
     scene = guide.scene
     packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
     # The sort wants room for a second copy.
-    keys = launcher.kept("gather.keys", max(2 * vpls.room, 1), wp.int32)
-    order = launcher.kept("gather.order", max(2 * vpls.room, 1), wp.int32)
-    parts = launcher.kept("gather.parts", 2, VplSets)
+    keys = launcher.scratch("gather.keys", max(2 * vpls.capacity, 1), wp.int32)
+    order = launcher.scratch("gather.order", max(2 * vpls.capacity, 1), wp.int32)
+    parts = launcher.scratch("gather.parts", 2, VplSets)
     lights, surfaces = VplSets(), VplSets()
     blocks = []
     for lit, name, begin, end in (
         (lights, "lights", 0, vpls.on_lights),
-        (surfaces, "surfaces", vpls.on_lights, vpls.room),
+        (surfaces, "surfaces", vpls.on_lights, vpls.capacity),
     ):
         most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
         blocks.append(most)
         lit.vpls, lit.order = vpls, order[begin:] if end > begin else order
-        lit.rows = launcher.kept(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
-        lit.colors = launcher.kept(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
+        lit.rows = launcher.scratch(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
+        lit.colors = launcher.scratch(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
         lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        lit.shapes = launcher.kept(f"gather.{name}.shapes", max(SHAPING_ROWS * most * lit.shaped, 1), vec16)
+        lit.shapes = launcher.scratch(f"gather.{name}.shapes", max(SHAPING_ROWS * most * lit.shaped, 1), vec16)
     inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, parts]
-    launcher.launch(_divide, max(vpls.room, 1), inputs)  # where nothing emits, that has to be said, too
-    wp.utils.radix_sort_pairs(keys, order, vpls.room)
+    launcher.launch(_divide, max(vpls.capacity, 1), inputs)  # where nothing emits, that has to be said, too
+    wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
     launcher.launch(_pack, sum(blocks), [parts])
     if lights.shaped:
         launcher.launch(_pack_shaping, blocks[0], [scene.data, parts])
