@@ -94,7 +94,11 @@ def _light_by_vpls(first: int, scene: SceneData, gbuffer: GBuffer, vpls: VplBuff
     total = wp.vec3(0.0)
     for k in range(vpls.count[0]):
         g = geometry_term(
-            gbuffer.position[i], gbuffer.normal[i], gbuffer.shading_normal[i], vpls.position[k], vpls.normal[k]
+            gbuffer.position[i],
+            gbuffer.normal_or_direct[i],
+            gbuffer.shading_normal[i],
+            vpls.position[k],
+            vpls.normal[k],
         )
         total += vpls.intensity[k] * g
     out[i] = total
@@ -107,7 +111,11 @@ def _shadowed_vpls(first: int, scene: SceneData, gbuffer: GBuffer, vpls: VplBuff
     total = wp.vec3(0.0)
     for k in range(vpls.count[0]):
         g = geometry_term(
-            gbuffer.position[i], gbuffer.normal[i], gbuffer.shading_normal[i], vpls.position[k], vpls.normal[k]
+            gbuffer.position[i],
+            gbuffer.normal_or_direct[i],
+            gbuffer.shading_normal[i],
+            vpls.position[k],
+            vpls.normal[k],
         )
         if g > 0.0 and visible(scene, gbuffer.position[i], vpls.position[k]):
             total += vpls.intensity[k] * g
@@ -132,7 +140,7 @@ def ray_sets(camera: Any, gbuffer: Any, vpls: Any, launcher: Launcher) -> dict[s
     launcher.launch(_camera_rays, count, [camera, origins, directions])
     random = np.random.default_rng(1)
     seen = gbuffer.mesh.numpy() >= 0
-    position, normal = gbuffer.position.numpy()[seen], gbuffer.normal.numpy()[seen]
+    position, normal = gbuffer.position.numpy()[seen], gbuffer.normal_or_direct.numpy()[seen]
     # A point on the unit sphere around the tip of the normal is a cosine-weighted direction.
     sphere = random.normal(size=normal.shape)
     diffuse = normal + sphere / np.linalg.norm(sphere, axis=1, keepdims=True) * 0.9999
@@ -177,7 +185,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     uploaded = upload_scene(scene, launcher)
     settings = ir.RenderSettings(width=width, height=width)
     camera = camera_data(scene.camera, uploaded.frame, settings)
-    gbuffer, *_ = new_gbuffer(launcher, width, width, mapped=uploaded.data.normal_map_count > 0, glows=True)
+    gbuffer, _ = new_gbuffer(launcher, width, width, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
         unguided(uploaded, launcher),
@@ -214,7 +222,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
 
     side = max(1, width // 4)  # brute force is slow: a smaller picture will do
     small = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=side, height=side))
-    gbuffer, *_ = new_gbuffer(launcher, side, side, mapped=uploaded.data.normal_map_count > 0, glows=True)
+    gbuffer, _ = new_gbuffer(launcher, side, side, mapped=uploaded.data.normal_map_count > 0, glows=True)
     trace_primary(uploaded, small, launcher, gbuffer, iteration=0, seed=0)
     out = launcher.empty(side * side, wp.vec3)
     n = int(vpls.count.numpy()[0])

@@ -83,8 +83,8 @@ def test_values_that_are_not_finite_stay_out(device):
     renderer.add_iteration(film, 0)
     bad = np.full((96, 3), 1.0, np.float32)
     bad[5], bad[6, 1] = np.inf, np.nan
-    renderer._direct.assign(bad)
-    film.add(renderer._gbuffer, renderer._direct, renderer._indirect)
+    renderer._gbuffer.normal_or_direct.assign(bad)
+    film.add(renderer._gbuffer)
     assert film.rejected == 2
     image = film.radiance().reshape(-1, 3)
     np.testing.assert_array_equal(image[[5, 6]], 0.5)
@@ -106,8 +106,8 @@ def test_long_renders_do_not_drift(device):
     renderer._indirect.zero_()
     film = renderer.new_film()
     for sample in samples:
-        renderer._direct.assign(sample)
-        film.add(renderer._gbuffer, renderer._direct, renderer._indirect)
+        renderer._gbuffer.normal_or_direct.assign(sample)
+        film.add(renderer._gbuffer)
     mean, error = film.radiance().reshape(96, 3), film.standard_error().reshape(96, 3)
     expected = samples.mean(axis=0, dtype=np.float64), samples.std(axis=0, ddof=1, dtype=np.float64) / math.sqrt(n)
     np.testing.assert_allclose(mean, expected[0], rtol=6.0 * 2.0**-25 * math.sqrt(n / 6.0))

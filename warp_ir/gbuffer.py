@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher, floats, partition
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher, float_count, partition
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.lights import emission_to_camera, intersect_lights
 from warp_ir.sampling import sobol
@@ -38,7 +38,9 @@ class GBuffer:
 
     mesh: wp.array[wp.int32]  # index into Scene.meshes; -1: background
     position: wp.array[wp.vec3]  # off the (smooth) surface, where shadow rays start
-    normal: wp.array[wp.vec3]  # geometric, or that of the smooth surface; light comes from its side alone
+    normal_or_direct: wp.array[wp.vec3]  # geometric normal (or the smooth surface's): light comes from its side alone;
+    # the estimator replaces it by the direct irradiance over π, which needs no memory of its own
+    indirect: wp.array[wp.vec3]  # irradiance over π by way of surfaces, from the estimator
     shading_normal: wp.array[wp.vec3]
     smooth_normal: wp.array[wp.vec3]  # the same without normal maps: by it surfaces are told apart
     albedo: wp.array[wp.vec3]
@@ -219,7 +221,7 @@ def _trace_primary(
     sight = trace_camera_ray(scene, camera, camera_ray(camera, pixel, place, lens))
     gbuffer.mesh[pixel] = sight.mesh
     gbuffer.position[pixel] = sight.position
-    gbuffer.normal[pixel] = sight.normal
+    gbuffer.normal_or_direct[pixel] = sight.normal
     gbuffer.smooth_normal[pixel] = sight.smooth_normal
     gbuffer.shading_normal[pixel] = sight.shading_normal  # the same array, if there are no maps
     gbuffer.albedo[pixel] = sight.albedo
@@ -232,20 +234,26 @@ def _trace_primary(
 
 def new_gbuffer(
     launcher: Launcher, columns: int, rows: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
-) -> tuple[Any, Any, Any, Any]:
-    """What an iteration fills in: a `GBuffer` of all pixels, and two irradiances over π.
+) -> tuple[GBuffer, wp.array[wp.float32]]:
+    """An uninitialised `GBuffer` of all pixels, and the block of float32 that most of its arrays lie in.
 
-    `mapped` says whether the scene has normal maps, `glows` whether the camera may see what emits, and `moving` whether
-    surfaces move while the shutter is open. The first irradiance takes the place of `normal`, which nothing needs
-    afterwards. The last is the block of float32 that all of it lies in, `spare` a pixel at least: scratch while no
-    iteration is in work.
+    The block has at least `spare` float32 a pixel: it is scratch memory while no iteration is in work.
+
+    Args:
+        launcher: Where to allocate.
+        columns: Pixels across.
+        rows: Pixels down.
+        mapped: Whether the scene has normal maps.
+        glows: Whether the camera may see anything that emits.
+        moving: Whether surfaces move while the shutter is open.
+        spare: Least size of the block [float32 per pixel].
     """
-    vectors = ["position", "normal", "shading_normal", "albedo"]
+    vectors = ["position", "normal_or_direct", "indirect", "shading_normal", "albedo"]
     vectors += ["smooth_normal"] * mapped + ["emission"] * glows
-    types = [*[wp.vec3] * (len(vectors) + 1), wp.int32, wp.float32]
+    types = [*[wp.vec3] * len(vectors), wp.int32, wp.float32]
     pixels = columns * rows
-    block = launcher.empty(pixels * max(floats(*types), spare), wp.float32)
-    *arrays, indirect, mesh, depth = partition(block, pixels, types)
+    block = launcher.empty(pixels * max(float_count(*types), spare), wp.float32)
+    *arrays, mesh, depth = partition(block, pixels, types)
     gbuffer = GBuffer()
     gbuffer.mesh, gbuffer.depth = mesh, depth
     gbuffer.tiles = all_tiles(columns, rows, launcher)
@@ -256,7 +264,7 @@ def new_gbuffer(
         gbuffer.emission = launcher.empty(0, wp.vec3)
     if not mapped:
         gbuffer.smooth_normal = gbuffer.shading_normal
-    return gbuffer, gbuffer.normal, indirect, block
+    return gbuffer, block
 
 
 def trace_primary(

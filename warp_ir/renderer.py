@@ -119,7 +119,7 @@ class Renderer:
             "spare": SCRATCH if settings.filters else 0,
         }
         if self._needs != needs:
-            self._gbuffer, self._direct, self._indirect, self._block = new_gbuffer(launcher, **needs)
+            self._gbuffer, self._block = new_gbuffer(launcher, **needs)
             self._needs = needs
 
     def _check_memory(self, scene: Scene) -> None:
@@ -152,9 +152,9 @@ class Renderer:
         self._gbuffer.tiles = film.tiles
         number = stratum(iteration, len(self._moments).bit_length() - 1)
         moment = self._moments[number]
-        moment.estimator.estimate(iteration, self._gbuffer, self._direct, self._indirect)
+        moment.estimator.estimate(iteration, self._gbuffer)
         with self.launcher.phase("film"), self.launcher.uninterruptible():  # no part of an iteration without the rest
-            film.add(self._gbuffer, self._direct, self._indirect, moment.exposure, number)
+            film.add(self._gbuffer, moment.exposure, number)
         wp.synchronize_device(self.launcher.device)
 
     def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:

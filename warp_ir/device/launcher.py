@@ -332,8 +332,8 @@ def partition(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
     """Arrays of so many rows of each type, one after the other in a block of float32: memory that is used twice."""
     arrays, begin = [], 0
     for dtype in dtypes:
-        end = begin + rows * floats(dtype)
-        arrays.append(block[begin:end].reshape((rows, -1) if floats(dtype) > 1 else rows).view(dtype))
+        end = begin + rows * float_count(dtype)
+        arrays.append(block[begin:end].reshape((rows, -1) if float_count(dtype) > 1 else rows).view(dtype))
         begin = end
     return arrays
 
@@ -347,7 +347,7 @@ def copy_record(record: Any) -> Any:
     return copy
 
 
-def floats(*dtypes: Any) -> int:
+def float_count(*dtypes: Any) -> int:
     """How many float32 a row of these types takes."""
     return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes) // 4
 

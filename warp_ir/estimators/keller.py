@@ -57,8 +57,6 @@ def _accumulate(
     gbuffer: GBuffer,
     vpls: VplBuffer,
     bound: float,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
 ) -> None:
     """E/π = 1/π Σ I min(G, bound) V, the VPLs on the lights (bounce 0) apart from the others; ρ is the film's."""
     pixel = pixel_at(gbuffer.tiles, first + wp.tid())
@@ -70,7 +68,11 @@ def _accumulate(
         position = gbuffer.position[pixel]
         for k in range(vpls.count[0]):
             g = geometry_term(
-                position, gbuffer.normal[pixel], gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k]
+                position,
+                gbuffer.normal_or_direct[pixel],
+                gbuffer.shading_normal[pixel],
+                vpls.position[k],
+                vpls.normal[k],
             )
             if g > 0.0:
                 modifiers = int(-1)
@@ -83,8 +85,8 @@ def _accumulate(
                     from_lights += irradiance
                 else:
                     from_surfaces += irradiance
-    direct[pixel] = from_lights / wp.pi
-    indirect[pixel] = from_surfaces / wp.pi
+    gbuffer.normal_or_direct[pixel] = from_lights / wp.pi
+    gbuffer.indirect[pixel] = from_surfaces / wp.pi
 
 
 class Keller:
@@ -96,8 +98,8 @@ class Keller:
         radius = settings.bound_radius * scene.extent
         self._bound = 1.0 / radius**2 if radius > 0.0 else 3.0e38
 
-    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
+    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
+        """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
@@ -114,5 +116,5 @@ class Keller:
             launcher.launch(
                 _accumulate,
                 indices(gbuffer.tiles),
-                [self._scene.data, gbuffer, vpls, self._bound, direct, indirect],
+                [self._scene.data, gbuffer, vpls, self._bound],
             )

@@ -67,8 +67,6 @@ def _trace_paths(
     gbuffer: GBuffer,
     scramble: wp.uint32,
     max_bounces: int,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
 ) -> None:
     """Follows one path from what the camera sees at a pixel."""
     pixel = pixel_at(gbuffer.tiles, first + wp.tid())
@@ -79,7 +77,7 @@ def _trace_paths(
     if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
         stream = sobol.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
         position = gbuffer.position[pixel]
-        normal = gbuffer.normal[pixel]
+        normal = gbuffer.normal_or_direct[pixel]
         shading_normal = gbuffer.shading_normal[pixel]
         mesh = gbuffer.mesh[pixel]
         throughput = wp.vec3(1.0)  # after the reflection at the pixel, which is the film's
@@ -122,8 +120,8 @@ def _trace_paths(
             shading_normal = hit.normal
             mesh = scene.triangle_mesh[hit.triangle]
             dimension += 6
-    direct[pixel] = once
-    indirect[pixel] = more
+    gbuffer.normal_or_direct[pixel] = once
+    gbuffer.indirect[pixel] = more
 
 
 class PathTracer:
@@ -133,8 +131,8 @@ class PathTracer:
         """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
         self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
 
-    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
+    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
+        """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
@@ -148,7 +146,5 @@ class PathTracer:
                     gbuffer,
                     wp.uint32(sobol.iteration_scramble(settings.seed, iteration)),
                     settings.bounce_limit,
-                    direct,
-                    indirect,
                 ],
             )

@@ -77,7 +77,7 @@ def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
 def _first_receiver(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
     x = ShadingPoint()
     x.position = gbuffer.position[pixel]
-    x.normal = gbuffer.normal[pixel]
+    x.normal = gbuffer.normal_or_direct[pixel]
     x.shading_normal = gbuffer.shading_normal[pixel]
     x.mesh = gbuffer.mesh[pixel]
     x.from_camera = True
@@ -91,8 +91,6 @@ def _gather_pixels(
     gbuffer: GBuffer,
     parts: wp.array[VplSets],
     settings: GatherSettings,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
 ) -> None:
     """Irradiance over π of what one pixel sees."""
     pixel = pixel_at(gbuffer.tiles, first + wp.tid())
@@ -157,8 +155,8 @@ def _gather_pixels(
             x.from_camera = False
             rays = settings.rays_after
             depth += 1
-    direct[pixel] = once / wp.pi
-    indirect[pixel] = more / wp.pi
+    gbuffer.normal_or_direct[pixel] = once / wp.pi
+    gbuffer.indirect[pixel] = more / wp.pi
 
 
 class VplEstimator:
@@ -174,8 +172,8 @@ class VplEstimator:
             if settings.iteration_limit > _UNGUIDED_ITERATIONS:
                 launcher.load([warp_ir.guiding.probes])
 
-    def estimate(self, iteration: int, gbuffer: Any, direct: Any, indirect: Any) -> None:
-        """Fills the G-buffer and the two irradiances over π, one row per pixel, for one iteration."""
+    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
+        """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
         scramble = sobol.iteration_scramble(settings.seed, iteration)
 
@@ -202,7 +200,7 @@ class VplEstimator:
             launcher.launch(
                 _gather_pixels,
                 indices(gbuffer.tiles),
-                [guide.scene.data, gbuffer, parts, how, direct, indirect],
+                [guide.scene.data, gbuffer, parts, how],
             )
 
     def _guide_of(self, iteration: int) -> Guide:

@@ -5,8 +5,6 @@ to rounding is forgotten as the samples are that it came with, and float32 does 
 iterations.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
@@ -62,8 +60,6 @@ def emission_of(film: FilmData, i: int) -> wp.vec3:
 def _add(
     first: int,
     gbuffer: GBuffer,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
     exposure: float,
     film: FilmData,
 ) -> None:
@@ -75,8 +71,8 @@ def _add(
     le = wp.vec3(0.0)
     if film.emission.shape[0] > 0:
         le = gbuffer.emission[i] * exposure
-    once = wp.cw_mul(gbuffer.albedo[i], direct[i]) * exposure
-    more = wp.cw_mul(gbuffer.albedo[i], indirect[i]) * exposure
+    once = wp.cw_mul(gbuffer.albedo[i], gbuffer.normal_or_direct[i]) * exposure
+    more = wp.cw_mul(gbuffer.albedo[i], gbuffer.indirect[i]) * exposure
     if not _finite(le + once + more):
         film.rejected[i] += 1
         le = wp.vec3(0.0)
@@ -100,6 +96,6 @@ def _add(
         film.depth[i] += gbuffer.depth[i]
 
 
-def add_samples(gbuffer: Any, direct: Any, indirect: Any, exposure: float, film: Any, launcher: Launcher) -> None:
-    """Adds to a `FilmData` what the camera saw in the tiles of a `GBuffer`, and the irradiance over π there."""
-    launcher.launch(_add, indices(gbuffer.tiles), [gbuffer, direct, indirect, exposure, film])
+def add_samples(gbuffer: GBuffer, exposure: float, film: FilmData, launcher: Launcher) -> None:
+    """Adds one iteration, the tiles of a `GBuffer` that an estimator has filled, to a `FilmData`."""
+    launcher.launch(_add, indices(gbuffer.tiles), [gbuffer, exposure, film])

@@ -14,6 +14,7 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.film.accumulate import FilmData, add_samples
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import measure
+from warp_ir.gbuffer import GBuffer
 from warp_ir.scene import InputError
 from warp_ir.tiles import TILE, all_tiles, some_tiles, tile_count
 
@@ -80,11 +81,11 @@ class Film:
         """How many iterations every tile of 8 x 8 pixels has had, [tiles], row by row."""
         return self.iterations - self._skipped
 
-    def add(self, gbuffer: Any, direct: Any, indirect: Any, exposure: float = 1.0, moment: int = 0) -> None:
-        """Adds one iteration: what the camera saw at some moment, and the irradiance over π estimated for it."""
-        add_samples(gbuffer, direct, indirect, exposure, self._data, self._launcher)
+    def add(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
+        """Adds one iteration: a G-buffer that an estimator has filled, for one of the shutter samples."""
+        add_samples(gbuffer, exposure, self._data, self._launcher)
         if self.reconstruction is not None:
-            self.reconstruction.accumulate(gbuffer, direct, indirect, moment)
+            self.reconstruction.accumulate(gbuffer, shutter_sample)
         self.iterations += 1
         if not self.chosen.all():
             self._skipped += ~self.chosen

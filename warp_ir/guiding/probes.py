@@ -65,7 +65,7 @@ def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scrambl
         found.score[row] = 0.0
         found.weight[row] = 0.0
     position = gbuffer.position[i]
-    normal = gbuffer.normal[i]
+    normal = gbuffer.normal_or_direct[i]
     shading_normal = gbuffer.shading_normal[i]
     throughput = gbuffer.albedo[i]
     mesh = gbuffer.mesh[i]
@@ -138,7 +138,7 @@ def trace_camera_probes(
     whole.visible_lights = 0
     paths = whole.columns * whole.rows
     scramble = sobol.iteration_scramble(settings.seed, _CAMERA_PATHS)
-    gbuffer, *_ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
+    gbuffer, _ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
     trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
     n = paths * _VERTICES * _ASKED
     rows = _Rows()

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import Launcher, floats, partition
+from warp_ir.device.launcher import Launcher, float_count, partition
+from warp_ir.gbuffer import GBuffer
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
 from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture
 from warp_ir.reconstruction.filter import filter_layer, new_layer
@@ -18,7 +19,7 @@ from warp_ir.reconstruction.sample_buffer import accumulate, estimate_means, new
 _FILTER_PASSES = 6.0
 """Filtering takes as long as so many passes of camera rays: fewer where rays are dear."""
 _TYPES = (wp.vec4, wp.vec4, wp.vec4, wp.vec4, wp.vec2)
-SCRATCH = floats(*_TYPES)
+SCRATCH = float_count(*_TYPES)
 """What making a picture takes for a while: float32 a pixel."""
 
 
@@ -45,12 +46,12 @@ class Reconstruction:
             self._seen, self._on_edges = new_sample_buffer(self._scene, self._camera, launcher, gbuffer, seed)
             self._blur = new_blur(moments, launcher) if self._camera.blurs else None
 
-    def accumulate(self, gbuffer: Any, direct: Any, indirect: Any, moment: int = 0) -> None:
+    def accumulate(self, gbuffer: GBuffer, shutter_sample: int = 0) -> None:
         """Adds one iteration's samples of irradiance over π, made at one of the moments."""
         if self._blur is not None:
-            accumulate_blurred(self._blur, self._seen, moment, gbuffer, direct, indirect, self._launcher)
+            accumulate_blurred(self._blur, self._seen, shutter_sample, gbuffer, self._launcher)
         else:
-            accumulate(self._seen, gbuffer, direct, indirect, self._launcher)
+            accumulate(self._seen, gbuffer, self._launcher)
 
     def arrays(self) -> dict[str, Any]:
         """The samples so far, by name: sums that add up when films are merged, and go on when one is resumed."""

@@ -108,8 +108,6 @@ def _aim(
     blur: Blur,
     moment: int,
     gbuffer: GBuffer,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
     seen: SampleBuffer,
     pixels: wp.array2d[wp.int32],
 ) -> None:
@@ -138,7 +136,7 @@ def _aim(
                     if same_surface(surfaces, near, point.position, point.normal) > MATCH:
                         pixels[0, i] = near
         if pixels[0, i] == none:
-            add_other(seen, p, direct[p], indirect[p])
+            add_other(seen, p, gbuffer.normal_or_direct[p], gbuffer.indirect[p])
 
 
 @wp.kernel(module="warp_ir.reconstruction.blur")
@@ -146,15 +144,15 @@ def _take(
     first: int,
     samples: int,
     pixels: wp.array2d[wp.int32],
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
+    gbuffer: GBuffer,
     seen: SampleBuffer,
 ) -> None:
     """Adds to each pixel the samples that are for it: a run of the sorted ones."""
     p = first + wp.tid()
     k = int(wp.lower_bound(pixels[0], 0, samples, p))
     while k < samples and pixels[0, k] == p:
-        add_sample(seen, p, direct[pixels[1, k]], indirect[pixels[1, k]])
+        q = pixels[1, k]
+        add_sample(seen, p, gbuffer.normal_or_direct[q], gbuffer.indirect[q])
         k += 1
 
 
@@ -217,15 +215,13 @@ def _shift(one: DeviceScene, other: DeviceScene) -> int | None:
     return None if len(shifts) > 1 else next(iter(shifts), 0)
 
 
-def accumulate_blurred(
-    blur: Any, seen: Any, moment: int, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher
-) -> None:
+def accumulate_blurred(blur: Any, seen: Any, shutter_sample: int, gbuffer: GBuffer, launcher: Launcher) -> None:
     """Adds one iteration's samples of irradiance over π, made at a moment, to `SampleBuffer`."""
     count = indices(gbuffer.tiles)
     order = launcher.scratch("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
-    launcher.launch(_aim, count, [blur, moment, gbuffer, direct, indirect, seen, order])
+    launcher.launch(_aim, count, [blur, shutter_sample, gbuffer, seen, order])
     wp.utils.radix_sort_pairs(order[0], order[1], count)
-    launcher.launch(_take, seen.count.shape[0], [count, order, direct, indirect, seen])
+    launcher.launch(_take, seen.count.shape[0], [count, order, gbuffer, seen])
 
 
 def estimate_missing_noise(seen: Any, launcher: Launcher) -> None:

@@ -80,8 +80,6 @@ def add_other(seen: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3) ->
 def _accumulate_samples(
     first: int,
     gbuffer: GBuffer,
-    direct: wp.array[wp.vec3],
-    indirect: wp.array[wp.vec3],
     seen: SampleBuffer,
 ) -> None:
     """Adds one iteration's sample of a pixel to those on its surface, or on none."""
@@ -91,9 +89,9 @@ def _accumulate_samples(
     surfaces = seen.surfaces
     if gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
         if same_surface(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]) > MATCH:
-            add_sample(seen, p, direct[p], indirect[p])
+            add_sample(seen, p, gbuffer.normal_or_direct[p], gbuffer.indirect[p])
         elif not shown_nearby(surfaces, p, gbuffer.position[p], gbuffer.smooth_normal[p]):
-            add_other(seen, p, direct[p], indirect[p])
+            add_other(seen, p, gbuffer.normal_or_direct[p], gbuffer.indirect[p])
 
 
 @wp.kernel
@@ -194,9 +192,9 @@ def sample_sums(seen: Any) -> dict[str, Any]:
     return {name: getattr(seen, name) for name in SampleBuffer.vars if name not in _NO_SUMS}
 
 
-def accumulate(seen: Any, gbuffer: Any, direct: Any, indirect: Any, launcher: Launcher) -> None:
+def accumulate(seen: Any, gbuffer: GBuffer, launcher: Launcher) -> None:
     """Adds one iteration's samples of irradiance over π to `SampleBuffer`."""
-    launcher.launch(_accumulate_samples, indices(gbuffer.tiles), [gbuffer, direct, indirect, seen])
+    launcher.launch(_accumulate_samples, indices(gbuffer.tiles), [gbuffer, seen])
 
 
 def estimate_means(seen: Any, noise: Any, layer: Any, launcher: Launcher) -> Any:
