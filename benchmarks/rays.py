@@ -192,7 +192,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
         launcher,
         paths=PATHS,
         absorption="roulette",
-        max_bounces=settings.bounce_limit,
+        max_bounces=settings.max_bounces,
         scramble=1,
     )
     try:

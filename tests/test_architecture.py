@@ -28,7 +28,7 @@ LAYERS = [
     ["gbuffer"],
     ["film", "vpl"],
     ["guiding", "reconstruction", "scheduling"],
-    ["estimators"],
+    ["estimators", "interrupt"],
     ["renderer"],
     ["preview"],
     ["cli"],

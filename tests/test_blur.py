@@ -142,9 +142,9 @@ def test_what_is_sharp_pays_nothing():
     """Without lens and shutter nothing is kept for them."""
     renderer = ir.Renderer(procedural.cornell_box(), replace(BLURRED, iterations=1))
     renderer.render()
-    assert renderer._gbuffer.anchor.shape[0] == 0
+    assert renderer._gbuffer.surface_point.shape[0] == 0
     assert "sample_pixels" not in renderer.launcher._kept
-    assert ir.Renderer(in_motion(), replace(BLURRED, iterations=1))._gbuffer.anchor.shape[0] == 48 * 48
+    assert ir.Renderer(in_motion(), replace(BLURRED, iterations=1))._gbuffer.surface_point.shape[0] == 48 * 48
 
 
 def test_the_denoiser_gets_features_without_noise():

@@ -159,7 +159,7 @@ def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
         for iteration in range(3):
             renderer.add_iteration(film, iteration)
             assert len(waits) == iteration + 1  # when it is done
-    renderer._tell(film)
+    renderer._report_profile(film)
     np.testing.assert_array_equal(film.radiance(), expected.radiance())
     assert film.counts == expected.counts
     if room is not None:

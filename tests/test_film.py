@@ -103,7 +103,7 @@ def test_long_renders_do_not_drift(device):
     film = renderer.new_film()
     renderer.add_iteration(film, 0)
     samples = np.random.default_rng(0).random((n, 96, 3)).astype(np.float32)
-    renderer._indirect.zero_()
+    renderer._gbuffer.indirect.zero_()
     film = renderer.new_film()
     for sample in samples:
         renderer._gbuffer.normal_or_direct.assign(sample)

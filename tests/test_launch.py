@@ -96,14 +96,6 @@ def test_errors_of_a_launch_are_raised():
     np.testing.assert_array_equal(out.numpy(), np.arange(1000, dtype=np.int32) ** 2)
 
 
-def test_kept_arrays_stay():
-    """A name gives the same array until it needs more rows, and other names give others."""
-    launcher = Launcher("cpu", 1)
-    first = launcher.scratch("a", 10, wp.int32)
-    assert launcher.scratch("a", 5, wp.int32) is first and launcher.scratch("b", 10, wp.int32) is not first
-    assert launcher.scratch("a", 100, wp.int32).shape[0] >= 100
-
-
 def test_unknown_device_is_named():
     """A device that is not there is an input error that lists those that are."""
     with pytest.raises(InputError, match=r"cuda:99.*available: cpu"):

@@ -203,7 +203,7 @@ def test_worth_of_cells():
 def test_both_halves_of_the_pilot_see_the_picture():
     """What is learned from one half of the camera paths is measured by the other: both are spread over the image."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=64, height=64, filter=False))
-    camera = renderer._moments[0].camera
+    camera = renderer._shutter[0].camera
     seen = trace_camera_probes(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
     middle = np.median(seen.position[seen.bounce == 0, :2], axis=0)
     for half in (seen.even, ~seen.even):

@@ -157,7 +157,7 @@ def test_the_time_that_is_left_goes_to_the_worst_tiles():
         stopping = AdaptiveScheduler(film, settings, True)
         renderer.add_iteration(film, 0)
         film.seconds = 1.0
-        report = stopping.look(0.0, 0.2)
+        report = stopping.update(0.0, 0.2)
         assert (report.fraction < 1.0) == (tiles is not None)
         if tiles is not None:
             assert film.chosen.sum() == tiles

@@ -50,7 +50,7 @@ _HOME = {
     "Film": "film",
     "Renderer": "renderer",
     "render": "renderer",
-    "trace_vpls": "renderer",
+    "trace_vpls": "vpl.trace",
     "write_image": "image",
     "read_image": "image",
 }

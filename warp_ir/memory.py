@@ -41,7 +41,7 @@ def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
     glows = scene.glows or settings.visible_lights
     iteration = _ITERATION + _COLOR * (glows + mapped)
     total = _FILM + _COLOR * glows + _COLOR
-    if settings.filters:
+    if settings.filter and settings.estimator == "vpl":
         iteration = max(iteration, _LAYERS)
         total += _OBSERVED + _FILTERED
         moments = scene.shutter if settings.motion_blur else ()

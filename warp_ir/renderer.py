@@ -3,62 +3,47 @@
     upload the scene
     repeat, for iteration i = 0, 1, 2, ...
         camera rays find what each pixel sees          -> GBuffer     gbuffer.py
-        light paths leave virtual point lights behind  -> VplBuffer   vpl.py
-        every pixel sums the light of the VPLs                        estimators/
-        the estimate is added                          -> Film        film.py
-    the picture is the mean
+        light paths leave virtual point lights (VPLs)  -> VplBuffer   vpl/emission.py
+        every pixel sums the light of the VPLs         -> GBuffer     estimators/, vpl/gather.py
+        the estimate is added to the mean              -> Film        film/accumulate.py
+    the picture is the mean, filtered                                 reconstruction/
 
-Iteration i depends on (scene, camera, settings, i) and nothing else: a picture is the same bits on any
-number of threads, and two films of different iterations add up to a better one.
+Iteration i depends on (scene, camera, settings, i) and on nothing else. So a picture has the same bits on any number of
+threads, and films of different iterations can be merged.
 """
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import warp as wp
 
 import warp_ir.bvh.build
-import warp_ir.estimators.keller
-import warp_ir.estimators.path
-import warp_ir.estimators.vpl
-import warp_ir.film.accumulate
-import warp_ir.gbuffer
-import warp_ir.reconstruction.blur
-import warp_ir.reconstruction.compose
-import warp_ir.reconstruction.filter
-import warp_ir.reconstruction.sample_buffer
-import warp_ir.vpl.emission
-import warp_ir.vpl.sets
 from warp_ir.device.launcher import Cancelled, Launcher
-from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
-from warp_ir.estimators import ESTIMATORS
+from warp_ir.device.scratch import Scratch
+from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_moments
+from warp_ir.estimators import ESTIMATORS, Estimator
+from warp_ir.film import ACCUMULATE_MODULES, Film
 from warp_ir.film.denoise import denoise_seconds
-from warp_ir.film.film import Film
-from warp_ir.gbuffer import new_gbuffer
+from warp_ir.gbuffer import GBuffer, new_gbuffer
+from warp_ir.interrupt import cancel_on_signal
 from warp_ir.memory import pixel_bytes
-from warp_ir.reconstruction import SCRATCH, Reconstruction, surfaces_move
-from warp_ir.sampling.sobol import iteration_scramble, stratum
+from warp_ir.reconstruction import BLUR_MODULES, FILTER_MODULES, SCRATCH, Reconstruction, surfaces_move
+from warp_ir.sampling.sobol import stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.scheduling import AdaptiveScheduler, Progress
 from warp_ir.settings import RenderSettings
-from warp_ir.vpl.emission import Vpls, emit_vpls, to_host
-from warp_ir.vpl.guide import unguided
 
 
 class Renderer:
     """A scene on a device, ready to add iterations to films."""
 
     def __init__(self, scene: Scene, settings: RenderSettings, *, device: str = "cpu", threads: int | None = None):
-        """Uploads the scene and compiles the kernels its estimator needs.
+        """Uploads the scene and compiles the kernels that its estimator needs.
 
         Args:
             scene: What to render.
-            settings: How.
+            settings: How to render it.
             device: "cpu", "cuda" or "cuda:N".
             threads: CPU threads; by default one per core. The picture does not depend on it.
 
@@ -67,139 +52,152 @@ class Renderer:
         """
         self.wanted = settings
         """The settings as given; in `settings` the height is definite."""
-        self.settings = _with_height(settings, scene)
         if settings.denoise:
-            denoise_seconds(1)  # before the work, not after it: it may be missing, and takes its time to start
+            denoise_seconds(1)  # starts the denoiser before the work: it may be missing, and starting takes a while
         self.launcher = Launcher(device, threads)
-        self._check_memory(scene)
-        self._told: tuple[dict[str, float], dict[str, int]] = ({}, {})
-        self._moments: list[_ShutterState] = []
-        self._needs: dict[str, Any] = {}  # of the buffers
-        large, small = _modules(settings.estimator)
+        self._scratch = Scratch(self.launcher)
+        self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
+        self._shutter: list[_ShutterState] = []
+        self._layout: _BufferLayout | None = None
+        self._take_settings(scene)
+        estimator = ESTIMATORS[settings.estimator]
         with self.launcher.loading():
-            self.launcher.load([*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *large])
-            self._take(scene)
-            self.launcher.load(small)
+            build = [warp_ir.bvh.build] if self.launcher.device.is_cpu else []
+            self.launcher.load([*build, *estimator.MODULES])  # what takes longest comes first
+            self._upload(scene)
+            self.launcher.load([*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES])
 
     def update(self, scene: Scene) -> None:
-        """Takes another scene in place of its own, and uploads what the two do not share.
+        """Replaces the scene, and uploads only what the two scenes do not share.
 
-        Films of the old one are not to be added to.
+        Films of the old scene must not be added to afterwards.
 
         Raises:
             InputError: The scene cannot be used.
         """
         self.launcher.profile.clear()
-        self._told = {}, {}
-        self.settings = _with_height(self.wanted, scene)
-        self._check_memory(scene)
+        self._reported = {}, {}
+        self._take_settings(scene)
         with self.launcher.loading():
-            self._take(scene)
-
-    def _take(self, scene: Scene) -> None:
-        settings, launcher = self.settings, self.launcher
-        if len(scene.shutter) & (len(scene.shutter) - 1):
-            raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
-        scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
-        uploaded = upload_moments(scenes, launcher, list({id(m.scene): m.scene for m in self._moments}.values()))
-        self._moments = []
-        for moment, data in zip(scenes, uploaded, strict=True):
-            camera = camera_data(moment.camera, data.frame, settings)
-            camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
-            estimator = ESTIMATORS[settings.estimator](data, camera, settings, launcher)
-            self._moments.append(_ShutterState(data, camera, estimator, moment.camera.exposure))
-        if camera.blurs and settings.filters:
-            launcher.load([warp_ir.reconstruction.blur])
-        needs = {
-            "columns": camera.columns,
-            "rows": camera.rows,
-            "mapped": any(data.data.normal_map_count > 0 for data in uploaded),
-            "glows": settings.visible_lights or any(moment.glows for moment in scenes),
-            "moving": settings.filters and surfaces_move(uploaded),
-            "spare": SCRATCH if settings.filters else 0,
-        }
-        if self._needs != needs:
-            self._gbuffer, self._block = new_gbuffer(launcher, **needs)
-            self._needs = needs
-
-    def _check_memory(self, scene: Scene) -> None:
-        _, _, columns, rows = self.settings.pixels()
-        needed, there = columns * rows * pixel_bytes(scene, self.settings), self.launcher.memory()
-        if needed > there:
-            raise InputError(
-                f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
-                f" {self.launcher.device} has {there / 2**30:.0f}"
-            )
+            self._upload(scene)
 
     @property
     def scene(self) -> DeviceScene:
-        """The scene on the device; the first moment of one with motion blur."""
-        return self._moments[0].scene
+        """The scene on the device; with motion blur, its first shutter sample."""
+        return self._shutter[0].scene
 
     def new_film(self) -> Film:
-        """An empty film of the right size."""
-        first = self._moments[0]
-        size = first.camera.columns, first.camera.rows
-        film = Film(*size, self.launcher, first.scene.frame, glows=self._needs["glows"])
+        """An empty film of the size that the settings ask for."""
+        first = self._shutter[0]
+        assert self._layout is not None
+        film = Film(
+            first.camera.columns, first.camera.rows, self.launcher, first.scene.frame, glows=self._layout.emission
+        )
         film.settings = self.settings
-        if self.settings.filters:
-            self._gbuffer.tiles, seed = film.tiles, self.settings.seed
-            film.reconstruction = Reconstruction(self._moments, self.launcher, self._gbuffer, self._block, seed)
+        if self._resolved.filter:
+            self._gbuffer.tiles = film.tiles
+            film.reconstruction = Reconstruction(
+                self._shutter, self.launcher, self._gbuffer, self._block, self.settings.seed
+            )
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
         self._gbuffer.tiles = film.tiles
-        number = stratum(iteration, len(self._moments).bit_length() - 1)
-        moment = self._moments[number]
-        moment.estimator.estimate(iteration, self._gbuffer)
-        with self.launcher.phase("film"), self.launcher.uninterruptible():  # no part of an iteration without the rest
-            film.add(self._gbuffer, moment.exposure, number)
+        number = stratum(iteration, len(self._shutter).bit_length() - 1)
+        state = self._shutter[number]
+        state.estimator.estimate(iteration, self._gbuffer)
+        with self.launcher.phase("film"), self.launcher.uninterruptible():  # an iteration is added whole or not at all
+            film.add(self._gbuffer, state.exposure, number)
         wp.synchronize_device(self.launcher.device)
 
     def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:
         """Adds iterations to a film until one of the settings' limits is reached.
 
-        SIGINT (Ctrl-C) and SIGTERM end it early: the film holds the iterations done so far and says `interrupted`.
+        SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and
+        `film.interrupted` is the number of the signal.
 
         Args:
-            film: From `new_film`, to go on with; None: a new one.
+            film: A film from `new_film`, to be continued; None: a new one.
             progress: Called after every iteration.
         """
         film = film or self.new_film()
         start = time.perf_counter() - film.seconds
-        with _signals_cancel(self.launcher, film):
-            stopping, profile = AdaptiveScheduler(film, self.settings, self._chooses_tiles()), self.launcher.profile
+        with cancel_on_signal(self.launcher, film):
+            scheduler = AdaptiveScheduler(film, self.settings, self._is_adaptive())
+            profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
             while not film.interrupted and film.iterations < self.settings.iteration_limit:
                 try:
                     self.add_iteration(film, film.iterations)
                     film.seconds = time.perf_counter() - start
                     spent = profile.since(before)
-                    reserve = self._finishing_seconds(film, spent["primary"] / (profile.counts["primary_rays"] - rays))
-                    report = stopping.look(reserve, spent["emission"] / spent.total())
+                    per_ray = spent["primary"] / (profile.counts["primary_rays"] - rays)
+                    report = scheduler.update(
+                        reserve=self._picture_seconds(film, per_ray), fixed=spent["emission"] / spent.total()
+                    )
                 except Cancelled:
                     break
                 if progress is not None:
                     progress(report)
                 if report.fraction >= 1.0:
                     break
-        film.radiance()  # filtered now, and remembered: it belongs to the render and its time
+        film.radiance()  # makes the picture, which the film keeps, within the time of the render
         film.seconds = time.perf_counter() - start
-        self._tell(film)
+        self._report_profile(film)
         return film
 
-    def _chooses_tiles(self) -> bool:
-        """Whether iterations may be for some tiles alone.
+    def _take_settings(self, scene: Scene) -> None:
+        """Fills in the settings that depend on the scene's camera, and refuses pictures too large for the memory."""
+        self._resolved = self.wanted.resolve(scene.camera.aspect)
+        self.settings = replace(self.wanted, height=self._resolved.height)
+        _, _, columns, rows = self.settings.pixels()
+        needed, available = columns * rows * pixel_bytes(scene, self._resolved), self.launcher.memory()
+        if needed > available:
+            raise InputError(
+                f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
+                f" {self.launcher.device} has {available / 2**30:.0f}"
+            )
 
-        What is chosen by its noise is no unbiased mean any more, and a shutter's moments are for all pixels alike.
+    def _upload(self, scene: Scene) -> None:
+        """Uploads every shutter sample of the scene, and allocates the buffers that an iteration fills in."""
+        settings, launcher = self._resolved, self.launcher
+        if len(scene.shutter) & (len(scene.shutter) - 1):
+            raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
+        scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
+        uploaded = upload_moments(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
+        self._shutter = []
+        for sample, device_scene in zip(scenes, uploaded, strict=True):
+            camera = camera_data(sample.camera, device_scene.frame, self.settings)
+            camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
+            estimator = ESTIMATORS[settings.estimator](device_scene, camera, settings, self._scratch)
+            self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure))
+        if camera.blurs and settings.filter:
+            launcher.load(BLUR_MODULES)
+        layout = _BufferLayout(
+            columns=camera.columns,
+            rows=camera.rows,
+            normal_maps=any(each.data.normal_map_count > 0 for each in uploaded),
+            emission=settings.visible_lights or any(sample.glows for sample in scenes),
+            moving=settings.filter and surfaces_move(uploaded),
+            spare=SCRATCH if settings.filter else 0,
+        )
+        if self._layout != layout:
+            self._gbuffer, self._block = layout.allocate(launcher)
+            self._layout = layout
+
+    def _is_adaptive(self) -> bool:
+        """Whether iterations may leave out tiles.
+
+        A picture whose tiles are chosen by their noise is no unbiased mean, and shutter samples are shared by all
+        pixels.
         """
-        settings = self.settings
+        settings = self._resolved
         limited = settings.time_limit is not None or settings.target_error is not None
-        return limited and settings.iterations is None and settings.filters and len(self._moments) == 1
+        return limited and settings.iterations is None and settings.filter and len(self._shutter) == 1
 
-    def _finishing_seconds(self, film: Film, per_ray: float) -> float:
-        """What making the picture will take [s], if a camera ray takes `per_ray`."""
+    def _picture_seconds(self, film: Film, per_ray: float) -> float:
+        """Estimated time to make the picture [s], if a camera ray takes `per_ray` [s]."""
         seconds = 0.0
         if film.reconstruction is not None:
             seconds += per_ray * film.width * film.height * film.reconstruction.passes(film.iterations)
@@ -207,26 +205,50 @@ class Renderer:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
 
-    def _tell(self, film: Film) -> None:
-        """Adds to a film's timings and counts what has happened since films were told last."""
+    def _report_profile(self, film: Film) -> None:
+        """Adds the timings and counts since the last report to the film's."""
         seconds, counts = self.launcher.profile.seconds(), self.launcher.profile.counted()
         for phase in seconds:
-            film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._told[0].get(phase, 0.0)
+            film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._reported[0].get(phase, 0.0)
         for what in counts:
-            film.counts[what] = film.counts.get(what, 0) + counts[what] - self._told[1].get(what, 0)
+            film.counts[what] = film.counts.get(what, 0) + counts[what] - self._reported[1].get(what, 0)
         film.counts["iterations"] = film.iterations
         film.counts["skipped_samples"] = film.skipped
-        self._told = seconds, counts
+        self._reported = seconds, counts
 
 
 @dataclass(frozen=True)
 class _ShutterState:
-    """The scene while the shutter is open: all of it, or one of the moments that stand for the time."""
+    """One sample of the time in which the shutter is open: the scene then, its camera, and what computes its light."""
 
     scene: DeviceScene
-    camera: Any
-    estimator: Any
+    camera: CameraData
+    estimator: Estimator
     exposure: float
+
+
+@dataclass(frozen=True)
+class _BufferLayout:
+    """What the buffers of an iteration must hold; they are allocated anew only when it changes."""
+
+    columns: int
+    rows: int
+    normal_maps: bool
+    emission: bool
+    moving: bool
+    spare: int
+
+    def allocate(self, launcher: Launcher) -> "tuple[GBuffer, wp.array[wp.float32]]":
+        """The G-buffer, and the block of memory it lies in."""
+        return new_gbuffer(
+            launcher,
+            self.columns,
+            self.rows,
+            mapped=self.normal_maps,
+            glows=self.emission,
+            moving=self.moving,
+            spare=self.spare,
+        )
 
 
 def render(
@@ -238,11 +260,12 @@ def render(
 ) -> Film:
     """Renders a scene until one of the settings' limits is reached.
 
-    SIGINT (Ctrl-C) and SIGTERM end it early: the film holds the iterations done so far and says `interrupted`.
+    SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and `film.interrupted` is
+    the number of the signal.
 
     Args:
         scene: What to render, from `load_usd` or made by hand.
-        settings: How; what the scene's file asks for (`Scene.settings`), and else the defaults, if None.
+        settings: How to render it; None: what the scene's file asks for (`Scene.settings`), and else the defaults.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called after every iteration.
 
@@ -251,69 +274,3 @@ def render(
     """
     renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
     return renderer.render(progress=progress)
-
-
-def _with_height(settings: RenderSettings, scene: Scene) -> RenderSettings:
-    """The settings with a definite height, by default from the camera's aspect."""
-    height = settings.height or max(1, round(settings.width * settings.pixel_aspect / scene.camera.aspect))
-    return replace(settings, height=height)  # checks the number of pixels again
-
-
-def trace_vpls(
-    scene: Scene, settings: RenderSettings | None = None, *, device: str = "cpu", iteration: int = 0
-) -> Vpls:
-    """The VPLs of one iteration, in world space, as if the whole scene was seen.
-
-    Args:
-        scene: Where to trace; empty arrays come back if nothing in it emits.
-        settings: `estimator`, `light_paths`, `absorption`, `max_bounces` and `seed` count.
-        device: Where to trace them.
-        iteration: Which iteration's VPLs.
-    """
-    settings = settings or RenderSettings()
-    launcher = Launcher(device)
-    uploaded = upload_scene(scene, launcher)
-    vpls = emit_vpls(
-        unguided(uploaded, launcher),
-        launcher,
-        paths=settings.path_count,
-        absorption=settings.path_end,
-        max_bounces=settings.bounce_limit,
-        scramble=iteration_scramble(settings.seed, iteration),
-    )
-    return to_host(vpls, uploaded)
-
-
-def _modules(estimator: str) -> tuple[list[Any], list[Any]]:
-    """What has kernels that an estimator needs for any scene: what takes long to compile, and the rest."""
-    if estimator == "vpl":
-        reconstruction = warp_ir.reconstruction.sample_buffer, warp_ir.reconstruction.filter
-        return [warp_ir.gbuffer, warp_ir.vpl.emission], [
-            *reconstruction,
-            warp_ir.vpl.sets,
-            warp_ir.film.accumulate,
-            warp_ir.reconstruction.compose,
-        ]
-    if estimator == "keller":
-        return [warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.estimators.keller], [warp_ir.film.accumulate]
-    return [warp_ir.gbuffer, warp_ir.estimators.path], [warp_ir.film.accumulate]
-
-
-@contextmanager
-def _signals_cancel(launcher: Launcher, film: Film) -> Iterator[None]:
-    """Makes SIGINT and SIGTERM stop the work in flight and mark the film, where Python allows it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, _: Any) -> None:
-        film.interrupted = number
-        launcher.cancel()
-
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        launcher.resume()

@@ -52,7 +52,7 @@ class AdaptiveScheduler:
         self._before = film.seconds, film.iterations, int(film.tile_iterations.sum())
         self._error = math.nan
 
-    def look(self, reserve: float, fixed: float) -> Progress:
+    def update(self, reserve: float, fixed: float) -> Progress:
         """Takes note of an iteration, and chooses the tiles of the next.
 
         Args:

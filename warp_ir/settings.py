@@ -13,7 +13,8 @@ ESTIMATOR_NAMES = ("vpl", "keller", "path")
 ABSORPTION_NAMES = ("roulette", "fractional")
 MAX_PIXELS = 1 << 28
 """Above this an image is refused on any machine; below, it depends on the memory there is."""
-_UNLIMITED = 2**31 - 1
+UNLIMITED = 2**31 - 1
+"""`ResolvedSettings.max_bounces` where there is no limit: more than there can be."""
 
 
 def _setting(default: Any, doc: str, choices: tuple[str, ...] = ()) -> Any:
@@ -117,31 +118,28 @@ class RenderSettings:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
 
-    @property
-    def bounce_limit(self) -> int:
-        """The longest chain of reflections, as kernels take it: unlimited is more than there can be."""
-        return _UNLIMITED if self.max_bounces is None else self.max_bounces
+    def resolve(self, aspect: float = 1.0) -> "ResolvedSettings":
+        """These settings with every default filled in.
 
-    @property
-    def path_count(self) -> int:
-        """Light paths per iteration: as set; else few for `keller`, to which every VPL at every pixel is a ray.
+        Args:
+            aspect: The camera's, width over height: it gives the height where none is set.
 
-        For `vpl` one for every eight pixels within limits: more would outlast what they light.
+        Raises:
+            InputError: The picture has too many pixels.
         """
-        if self.light_paths is not None:
-            return self.light_paths
-        pixels = self.width * (self.height or self.width)
-        return 512 if self.estimator == "keller" else 1 << (min(max(pixels // 8, 1024), 4096).bit_length() - 1)
-
-    @property
-    def filters(self) -> bool:
-        """Whether the noise is filtered: as set, if the estimator is one whose noise can be."""
-        return self.filter and self.estimator == "vpl"
-
-    @property
-    def path_end(self) -> str:
-        """The absorption that holds: as set; else fractional for `keller`, as published, roulette otherwise."""
-        return self.absorption or ("fractional" if self.estimator == "keller" else "roulette")
+        height = self.height or max(1, round(self.width * self.pixel_aspect / aspect))
+        keller = self.estimator == "keller"
+        # For keller every VPL is a ray at every pixel. For vpl there is a light path for every eight pixels, within
+        # limits: more would take longer to trace than what they light takes to gather.
+        default_paths = 1 << (min(max(self.width * height // 8, 1024), 4096).bit_length() - 1)
+        values = self.to_dict() | {
+            "height": height,
+            "light_paths": self.light_paths or (512 if keller else default_paths),
+            "max_bounces": UNLIMITED if self.max_bounces is None else self.max_bounces,
+            "absorption": self.absorption or ("fractional" if keller else "roulette"),
+            "filter": self.filter and self.estimator == "vpl",
+        }
+        return ResolvedSettings(**values)
 
     def _check(self, name: str, good: bool, wanted: str) -> None:
         if not good:
@@ -167,3 +165,14 @@ class RenderSettings:
 
 def _positive(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < math.inf
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResolvedSettings(RenderSettings):
+    """Settings in which no default is left to be filled in: what `RenderSettings.resolve` returns."""
+
+    height: int
+    light_paths: int
+    max_bounces: int
+    """`UNLIMITED` where there is no limit."""
+    absorption: str

@@ -1,29 +1,29 @@
-"""A context for importing native packages."""
+"""While foreign code imports itself."""
 
 import gc
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+from typing import Any
 
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Delays SIGINT and SIGTERM, and disables garbage collection, until the imports inside are done.
+    """SIGINT and SIGTERM arrive when what is imported inside is there, and nobody looks for garbage in it.
 
-    USD's modules import each other from C++ code, which prints a Python exception and continues: a Ctrl-C would be lost
-    and the command would run to its end. Modules define no garbage, and collecting it would take a sixth of the import
-    time.
+    USD's modules import each other from C++, which prints an exception that comes up meanwhile and goes on: the Ctrl-C
+    would be lost, and the command run to its end. What modules define is no garbage: looking for some takes a sixth of
+    the time.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    collection_enabled = gc.isenabled()
+    collects = gc.isenabled()
     gc.disable()
     arrived: list[int] = []
 
-    def note(number: int, _: FrameType | None) -> None:
+    def note(number: int, _: Any) -> None:
         arrived.append(number)
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -32,7 +32,7 @@ def importing() -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-        if collection_enabled:
+        if collects:
             gc.enable()
     if arrived:
         signal.raise_signal(arrived[0])

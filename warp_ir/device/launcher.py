@@ -17,8 +17,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.profiling import Profile
@@ -89,8 +87,6 @@ class Launcher:
         self._beside: str | None = None  # phase of the launches that nobody waits for
         self._whole = False
         self._cancelled = threading.Event()
-        self._scratch: dict[str, Any] = {}
-        self._tables: dict[str, tuple[npt.NDArray[Any], Any]] = {}
 
     def load(self, modules: Sequence[Any]) -> None:
         """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
@@ -293,24 +289,6 @@ class Launcher:
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""
         return wp.empty(shape, dtype=dtype, device=self.device)
-
-    def scratch(self, name: str, rows: int, dtype: Any) -> Any:
-        """An array of at least `rows`, the same whenever `name` asks again: iterations allocate nothing.
-
-        It is uninitialised at first, and later holds what was written to it last.
-        """
-        array = self._scratch.get(name)
-        if array is None or array.shape[0] < rows:
-            # Some room, for the number of VPLs differs a little from iteration to iteration.
-            array = self._scratch[name] = self.empty(rows + rows // 8, dtype)
-        return array
-
-    def cached_upload(self, name: str, data: npt.NDArray[Any], dtype: Any) -> Any:
-        """Host data on the device, uploaded only when they differ from what `name` was last."""
-        known = self._tables.get(name)
-        if known is None or not np.array_equal(known[0], data):
-            known = self._tables[name] = data, self.array(data, dtype)
-        return known[1]
 
     def at_most(self, number: Any, limit: int) -> int:
         """For how many rows to make room and to launch: a number on the device [1], or `limit` if that is less.

@@ -1,27 +1,32 @@
 """The ways to compute the light. Each is one file with one verb: add one iteration to a film.
 
-An estimator is built as ``Estimator(scene, camera, settings, launcher)`` from an uploaded scene and a
+An estimator is built as ``Estimator(scene, camera, settings, scratch)`` from an uploaded scene and a
 `CameraData`, and then ``estimate(iteration, gbuffer)`` fills, for
 every pixel of the tiles of `gbuffer`, what the camera sees and its irradiance over π by way of the lights and by
 way of surfaces. What it computes depends on these arguments alone.
 """
 
-from typing import Any, Protocol
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar, Protocol
 
-from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene import DeviceScene
+from warp_ir.device.scratch import Scratch
+from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.estimators.keller import Keller
 from warp_ir.estimators.path import PathTracer
 from warp_ir.estimators.vpl import VplEstimator
 from warp_ir.gbuffer import GBuffer
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 
 
 class Estimator(Protocol):
     """One way to compute the light."""
 
-    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
-        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
+    MODULES: ClassVar[Sequence[ModuleType]]
+    """Modules with the kernels that it launches, those that take longest to compile first."""
+
+    def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
+        """Prepares for a scene, a camera and settings; what an iteration overwrites lies in `scratch`."""
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""

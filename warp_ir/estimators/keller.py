@@ -16,16 +16,22 @@ jitters the camera rays and renews the VPLs; the picture is the mean of the iter
 Nothing here is clever, and that is the point: it is the page to read first, and the baseline to beat.
 """
 
-from typing import Any
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar
 
 import warp as wp
 
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher
-from warp_ir.device_scene import DeviceScene, SceneData
+import warp_ir.gbuffer
+import warp_ir.vpl.emission
+from warp_ir.device.launcher import MAX_REGISTERS
+from warp_ir.device.scratch import Scratch
+from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.lights import light_visibility
 from warp_ir.sampling.sobol import iteration_scramble
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 from warp_ir.tiles import indices, pixel_at
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
@@ -92,9 +98,13 @@ def _accumulate(
 class Keller:
     """Every VPL, every shadow ray."""
 
-    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
-        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
-        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+    MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, sys.modules[__name__])
+
+    def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
+        """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
+        self._scene, self._camera, self._settings = scene, camera, settings
+        self._scratch, self._launcher = scratch, scratch.launcher
+        self._unguided = unguided(scene, scratch.launcher)
         radius = settings.bound_radius * scene.extent
         self._bound = 1.0 / radius**2 if radius > 0.0 else 3.0e38
 
@@ -105,11 +115,11 @@ class Keller:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
         with launcher.phase("emission"):
             vpls = emit_vpls(
-                unguided(self._scene, launcher),
-                launcher,
-                paths=settings.path_count,
-                absorption=settings.path_end,
-                max_bounces=settings.bounce_limit,
+                self._unguided,
+                self._scratch,
+                paths=settings.light_paths,
+                absorption=settings.absorption,
+                max_bounces=settings.max_bounces,
                 scramble=iteration_scramble(settings.seed, iteration),
             )
         with launcher.phase("gather"):

@@ -8,11 +8,16 @@ Surfaces are shaded with interpolated normals where the camera sees them, and wi
 where light bounces between them, as the VPLs do: so energy is conserved and both compute the same integral.
 """
 
-from typing import Any
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar
 
 import warp as wp
 
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher
+import warp_ir.gbuffer
+from warp_ir.device.launcher import MAX_REGISTERS
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
 from warp_ir.lights import (
@@ -25,7 +30,7 @@ from warp_ir.lights import (
 )
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
 
@@ -127,9 +132,12 @@ def _trace_paths(
 class PathTracer:
     """Unidirectional path tracing with next-event estimation."""
 
-    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
-        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
-        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
+    MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, sys.modules[__name__])
+
+    def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
+        """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
+        self._scene, self._camera, self._settings = scene, camera, settings
+        self._scratch, self._launcher = scratch, scratch.launcher
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
@@ -145,6 +153,6 @@ class PathTracer:
                     self._camera,
                     gbuffer,
                     wp.uint32(sobol.iteration_scramble(settings.seed, iteration)),
-                    settings.bounce_limit,
+                    settings.max_bounces,
                 ],
             )

@@ -12,19 +12,25 @@ that light, no more: nothing counts twice.
 The bound follows the density of the VPLs (`gather.build_sets`): no length in scene units is chosen anywhere.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar
 
 import warp as wp
 
+import warp_ir.gbuffer
 import warp_ir.guiding.probes
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher
-from warp_ir.device_scene import DeviceScene, SceneData
+import warp_ir.vpl.emission
+import warp_ir.vpl.sets
+from warp_ir.device.launcher import MAX_REGISTERS
+from warp_ir.device.scratch import Scratch
+from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, trace_primary
 from warp_ir.guiding import guiding_applies, learn
 from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest
 from warp_ir.tiles import indices, pixel_at
 from warp_ir.vpl.emission import emit_vpls
@@ -162,15 +168,18 @@ def _gather_pixels(
 class VplEstimator:
     """Few shadow rays, resampled; bounded and compensated."""
 
-    def __init__(self, scene: DeviceScene, camera: Any, settings: RenderSettings, launcher: Launcher) -> None:
-        """Prepares for a scene, a `CameraData` and settings with a definite width and height."""
-        self._scene, self._camera, self._settings, self._launcher = scene, camera, settings, launcher
-        self._unguided = unguided(scene, launcher)
+    MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.vpl.sets)
+
+    def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
+        """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
+        self._scene, self._camera, self._settings = scene, camera, settings
+        self._scratch, self._launcher = scratch, scratch.launcher
+        self._unguided = unguided(scene, scratch.launcher)
         self._guide: Guide | None = self._unguided
         if guiding_applies(scene):
             self._guide = None  # to be learned
             if settings.iteration_limit > _UNGUIDED_ITERATIONS:
-                launcher.load([warp_ir.guiding.probes])
+                scratch.launcher.load([warp_ir.guiding.probes])
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
@@ -184,18 +193,18 @@ class VplEstimator:
         with launcher.overlap("primary", look), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
-                launcher,
-                paths=settings.path_count,
-                absorption=settings.path_end,
-                max_bounces=settings.bounce_limit,
+                self._scratch,
+                paths=settings.light_paths,
+                absorption=settings.absorption,
+                max_bounces=settings.max_bounces,
                 scramble=scramble,
             )
-            parts = build_sets(vpls, guide, launcher)
+            parts = build_sets(vpls, guide, self._scratch)
         how = GatherSettings()
         how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
         how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
         how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
-        how.max_bounces = settings.bounce_limit
+        how.max_bounces = settings.max_bounces
         with launcher.phase("gather"):
             launcher.launch(
                 _gather_pixels,

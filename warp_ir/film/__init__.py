@@ -1,5 +1,9 @@
 """The film: the running mean of the iterations, its standard error, and the picture made of it."""
 
+from warp_ir.film import accumulate
 from warp_ir.film.film import Film
 
-__all__ = ["Film"]
+ACCUMULATE_MODULES = (accumulate,)
+"""Modules with the kernels that every film needs."""
+
+__all__ = ["ACCUMULATE_MODULES", "Film"]

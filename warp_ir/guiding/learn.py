@@ -25,7 +25,7 @@ from warp_ir.guiding.importance import learn_survival
 from warp_ir.guiding.photon_target import learn_photon_target
 from warp_ir.guiding.probes import connect_vpls, trace_camera_probes
 from warp_ir.scene import LightKind
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 from warp_ir.vpl.guide import Guide, unguided
 
 _APART = 0.25
@@ -55,7 +55,7 @@ def guiding_applies(scene: DeviceScene) -> bool:
     return len(places) > 1 and bool(np.linalg.norm(np.ptp(places, axis=0)) > _APART * np.linalg.norm(upper - lower))
 
 
-def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderSettings) -> Guide:
+def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: ResolvedSettings) -> Guide:
     """Sends the pilot, and returns where light paths should go.
 
     What it has decided is in the launcher's counts: `guided_emitters`, `guided_far_lights`, `guided_vpls` are 1 or 0.
@@ -70,7 +70,7 @@ def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: RenderS
     pixels = camera.image_columns * camera.image_rows
     paths = min(max(pixels // 16, _FEWEST), _MOST)
     # VPLs are dropped only where more paths can make up for them: else there would be less noise, but in larger spots.
-    most = min(pixels // (_PIXELS_PER_PATH * settings.path_count), _MOST_PATHS)
+    most = min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MOST_PATHS)
     chosen = photon_target = importance = None
     left = _VPLS_PER_PATH
     if scene.emits:

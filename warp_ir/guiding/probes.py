@@ -9,12 +9,13 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import MAX_REGISTERS, Launcher, copy_record
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
 from warp_ir.lights import light_visibility, sample_direct, select_emitter
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest, visible
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import CELLS, Guide, cell_of
@@ -127,7 +128,7 @@ class CameraProbes:
 
 
 def trace_camera_probes(
-    scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: RenderSettings
+    scene: DeviceScene, camera: Any, launcher: Launcher, paths: int, settings: ResolvedSettings
 ) -> CameraProbes:
     """Sends about so many paths from all over the image."""
     whole = copy_record(camera)
@@ -149,7 +150,7 @@ def trace_camera_probes(
 
     emitter, score = rows.emitter.numpy(), _finite(rows.score.numpy())
     bounce = np.arange(n) // _ASKED % _VERTICES
-    there = (emitter >= 0) & (bounce <= settings.bounce_limit)
+    there = (emitter >= 0) & (bounce <= settings.max_bounces)
     score[~there] = 0.0
     row, column = np.divmod(np.arange(paths), whole.columns)
     tile = row * _TILES // whole.rows * _TILES + column * _TILES // whole.columns
@@ -230,16 +231,16 @@ class VplConnections:
 
 
 def connect_vpls(
-    guide: Guide, launcher: Launcher, seen: CameraProbes, paths: int, settings: RenderSettings
+    guide: Guide, launcher: Launcher, seen: CameraProbes, paths: int, settings: ResolvedSettings
 ) -> VplConnections:
     """Traces light paths and connects their VPLs with what the camera sees, if the light gets there."""
     scene = guide.scene
     vpls = emit_vpls(
         guide,
-        launcher,
+        Scratch(launcher),
         paths=paths,
         absorption="roulette",
-        max_bounces=settings.bounce_limit,
+        max_bounces=settings.max_bounces,
         scramble=sobol.iteration_scramble(settings.seed, _LIGHT_PATHS),
     )
     on_surfaces = int(vpls.count.numpy()[0]) - vpls.on_lights

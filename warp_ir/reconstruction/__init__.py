@@ -13,7 +13,17 @@ noise. On edges a part of the difference is given back, as much of it as is not 
 (`compose.py`).
 """
 
+from warp_ir.reconstruction import blur, compose, filter, sample_buffer
 from warp_ir.reconstruction.reconstruct import SCRATCH, Reconstruction
 from warp_ir.reconstruction.reprojection import surfaces_move
 
-__all__ = ["SCRATCH", "Reconstruction", "surfaces_move"]
+FILTER_MODULES = (
+    sample_buffer,
+    filter,
+    compose,
+)
+"""Modules with the kernels of the filter."""
+BLUR_MODULES = (blur,)
+"""Modules with the kernels that a lens or an open shutter needs in addition."""
+
+__all__ = ["BLUR_MODULES", "FILTER_MODULES", "SCRATCH", "Reconstruction", "surfaces_move"]

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher, float_count, partition
+from warp_ir.device.scratch import Scratch
 from warp_ir.gbuffer import GBuffer
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
 from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture
@@ -42,6 +43,7 @@ class Reconstruction:
         self._scene, self._camera = middle.scene, middle.camera
         self._exposure = sum(m.exposure for m in moments) / len(moments)
         self._launcher, self._block = launcher, weakref.ref(block)
+        self._scratch = Scratch(launcher)
         with launcher.phase("filter"):
             self._seen, self._on_edges = new_sample_buffer(self._scene, self._camera, launcher, gbuffer, seed)
             self._blur = new_blur(moments, launcher) if self._camera.blurs else None
@@ -49,7 +51,7 @@ class Reconstruction:
     def accumulate(self, gbuffer: GBuffer, shutter_sample: int = 0) -> None:
         """Adds one iteration's samples of irradiance over π, made at one of the moments."""
         if self._blur is not None:
-            accumulate_blurred(self._blur, self._seen, shutter_sample, gbuffer, self._launcher)
+            accumulate_blurred(self._blur, self._seen, shutter_sample, gbuffer, self._scratch)
         else:
             accumulate(self._seen, gbuffer, self._launcher)
 

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, SurfacePoint, project
 from warp_ir.reconstruction.pixel_surfaces import MATCH, pixel_around, same_surface
@@ -215,10 +216,10 @@ def _shift(one: DeviceScene, other: DeviceScene) -> int | None:
     return None if len(shifts) > 1 else next(iter(shifts), 0)
 
 
-def accumulate_blurred(blur: Any, seen: Any, shutter_sample: int, gbuffer: GBuffer, launcher: Launcher) -> None:
+def accumulate_blurred(blur: Any, seen: Any, shutter_sample: int, gbuffer: GBuffer, scratch: Scratch) -> None:
     """Adds one iteration's samples of irradiance over π, made at a moment, to `SampleBuffer`."""
-    count = indices(gbuffer.tiles)
-    order = launcher.scratch("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
+    launcher, count = scratch.launcher, indices(gbuffer.tiles)
+    order = scratch.array("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
     launcher.launch(_aim, count, [blur, shutter_sample, gbuffer, seen, order])
     wp.utils.radix_sort_pairs(order[0], order[1], count)
     launcher.launch(_take, seen.count.shape[0], [count, order, gbuffer, seen])

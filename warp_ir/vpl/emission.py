@@ -10,14 +10,13 @@ A VPL lights the side its normal faces and no other. Power is divided by the pat
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher
+from warp_ir.device.launcher import MAX_REGISTERS
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import DeviceScene, SceneData
 from warp_ir.lights import PhotonTarget, emit_photon, first_reflection, sample_light
 from warp_ir.sampling import sobol
@@ -262,28 +261,28 @@ def survivors(paths: int, mean_albedo: float) -> npt.NDArray[np.int32]:
 
 def emit_vpls(
     guide: Guide,
-    launcher: Launcher,
+    scratch: Scratch,
     *,
     paths: int,
     absorption: str,
     max_bounces: int,
     scramble: int,
-) -> Any:
+) -> VplBuffer:
     """Traces light paths and returns the `VplBuffer` of all their vertices; none if nothing emits.
 
-    Its arrays are the launcher's, have room to spare, and are overwritten by the next call.
+    Its arrays belong to `scratch`, have room to spare, and are overwritten by the next call with it.
 
     Args:
         guide: The uploaded scene, and where in it paths go.
-        launcher: Where to run.
+        scratch: Owns the buffer's arrays, and says where to run.
         paths: VPLs on lights; as many light paths are started, times those of the guide.
         absorption: "fractional" or "roulette".
         max_bounces: Longest chain of reflections.
         scramble: 32-bit scramble of the sequence: another one is an independent estimate.
     """
-    scene, on_lights = guide.scene, paths
+    scene, launcher, on_lights = guide.scene, scratch.launcher, paths
     if not scene.emits:
-        vpls = _buffer(scene, launcher, "vpls", 0, 0)
+        vpls = _buffer(scene, scratch, "vpls", 0, 0)
         vpls.count.zero_()
         return vpls
     settings = PathSettings()
@@ -292,21 +291,21 @@ def emit_vpls(
     settings.paths, settings.on_lights = paths, on_lights
     settings.photon_target, settings.importance = guide.photon_target, guide.importance
     settings.max_bounces = max_bounces
-    settings.survivors = launcher.scratch("survivors", 1, wp.int32)
+    settings.survivors = scratch.array("survivors", 1, wp.int32)
     if absorption == "fractional":
         alive = survivors(paths, scene.mean_albedo)
         settings.fractional, settings.levels = 1, len(alive)
-        settings.survivors = launcher.cached_upload("survivors", alive, wp.int32)
+        settings.survivors = scratch.upload("survivors", alive, wp.int32)
     recorded = _recorded_length(paths, scene.mean_albedo)
     settings.recorded = min(recorded, max_bounces)
     settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
     # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
-    lengths, ends = launcher.scratch("lengths", paths, wp.int32), launcher.scratch("ends", paths, wp.int32)
-    traced = _buffer(scene, launcher, "traced", on_lights, paths * settings.recorded)
+    lengths, ends = scratch.array("lengths", paths, wp.int32), scratch.array("ends", paths, wp.int32)
+    traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
-    vpls = _buffer(scene, launcher, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.capacity))
+    vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
     launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
@@ -319,48 +318,16 @@ def _recorded_length(paths: int, mean_albedo: float) -> int:
     return max(min(math.ceil(math.log(_RETRACED_SHARE) / math.log(rho)), _MAX_RECORDED // paths), 1)
 
 
-def _buffer(scene: DeviceScene, launcher: Launcher, name: str, on_lights: int, on_surfaces: int) -> Any:
+def _buffer(scene: DeviceScene, scratch: Scratch, name: str, on_lights: int, on_surfaces: int) -> VplBuffer:
     vpls = VplBuffer()
     vpls.on_lights, vpls.capacity = on_lights, on_lights + on_surfaces
-    vpls.count = launcher.scratch(name + ".count", 1, wp.int32)
+    vpls.count = scratch.array(name + ".count", 1, wp.int32)
     rows = max(vpls.capacity, 1)
-    vpls.position = launcher.scratch(name + ".position", rows, wp.vec4)
-    vpls.normal = launcher.scratch(name + ".normal", rows, wp.vec4)
-    vpls.intensity = launcher.scratch(name + ".intensity", rows, wp.vec3)
-    vpls.bounce = launcher.scratch(name + ".bounce", rows, wp.int32)
-    vpls.pdf_area = launcher.scratch(name + ".density", max(on_lights, 1), wp.float32)
+    vpls.position = scratch.array(name + ".position", rows, wp.vec4)
+    vpls.normal = scratch.array(name + ".normal", rows, wp.vec4)
+    vpls.intensity = scratch.array(name + ".intensity", rows, wp.vec3)
+    vpls.bounce = scratch.array(name + ".bounce", rows, wp.int32)
+    vpls.pdf_area = scratch.array(name + ".pdf_area", max(on_lights, 1), wp.float32)
     modifiers = max(on_lights, 1) if scene.data.modifier_count > 0 else 1
-    vpls.modifiers = launcher.scratch(name + ".control", modifiers, wp.int32)
+    vpls.modifiers = scratch.array(name + ".modifiers", modifiers, wp.int32)
     return vpls
-
-
-@dataclass(frozen=True)
-class Vpls:
-    """A VPL cloud in world space, as NumPy arrays."""
-
-    positions: npt.NDArray[np.float64]
-    """[n, 3], world space; where `directional`, the unit direction towards the light."""
-    normals: npt.NDArray[np.float32]
-    """[n, 3], unit; zero where the VPL shines the same in all directions."""
-    intensity: npt.NDArray[np.float32]
-    """[n, 3], along the normal, before shaping [W/sr]; where `directional`, the irradiance [W/m²] on a surface that
-    faces it."""
-    bounce: npt.NDArray[np.int32]
-    """[n], reflections before: 0 is a point on a light."""
-    directional: npt.NDArray[np.bool_]
-    """[n], whether the VPL is infinitely far away."""
-
-
-def to_host(vpls: Any, scene: DeviceScene) -> Vpls:
-    """Copies a `VplBuffer` back to world space."""
-    n = int(vpls.count.numpy()[0])
-    position, normal = vpls.position.numpy()[:n], vpls.normal.numpy()[:n]
-    directional = position[:, 3] == 0.0
-    area = np.where(directional, 1.0, scene.frame.scale**-2.0)[:, None]
-    return Vpls(
-        positions=np.where(directional[:, None], position[:, :3], scene.frame.to_world(position[:, :3])),
-        normals=normal[:, :3].copy(),
-        intensity=(vpls.intensity.numpy()[:n] * area).astype(np.float32),
-        bounce=vpls.bounce.numpy()[:n].copy(),
-        directional=directional,
-    )

@@ -82,8 +82,8 @@ def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
     """Light paths begin in proportion to power, and all VPLs are kept."""
     photon_target, importance = PhotonTarget(), VplImportance()
     photon_target.focus, photon_target.cdf = (
-        launcher.scratch("no.focus", 1, wp.vec4),
-        launcher.scratch("no.cdf", 1, wp.float32),
+        launcher.empty(1, wp.vec4),
+        launcher.empty(1, wp.float32),
     )
-    importance.per_intensity = launcher.scratch("no.worth", 1, wp.float32)
+    importance.per_intensity = launcher.empty(1, wp.float32)
     return Guide(scene, photon_target, importance)

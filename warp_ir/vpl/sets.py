@@ -5,11 +5,10 @@ distributed, so every set alone is an unbiased estimate of the light (interleave
 """
 
 import math
-from typing import Any
 
 import warp as wp
 
-from warp_ir.device.launcher import Launcher
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import SceneData
 from warp_ir.lights import Bound, bound_for_pdf
 from warp_ir.vpl.emission import VplBuffer
@@ -216,19 +215,19 @@ def _pack_shaping(first: int, scene: SceneData, parts: wp.array[VplSets]) -> Non
             lit.shapes[SHAPING_ROWS * i + 3 + k][lane] = ramp[k]
 
 
-def build_sets(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
+def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplSets]:
     """The `VplSets` of the VPLs on lights and of those on surfaces: two rows.
 
     The area of the scene's surfaces, the number of VPLs that a pixel weighs and how densely the guide puts them give
     the bound on G. All that depends on the number of VPLs is left to the device; here there is room for as many as
     there may be, and what is launched beyond ends at once.
     """
-    scene = guide.scene
+    scene, launcher = guide.scene, scratch.launcher
     packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
     # The sort wants room for a second copy.
-    keys = launcher.scratch("gather.keys", max(2 * vpls.capacity, 1), wp.int32)
-    order = launcher.scratch("gather.order", max(2 * vpls.capacity, 1), wp.int32)
-    parts = launcher.scratch("gather.parts", 2, VplSets)
+    keys = scratch.array("gather.keys", max(2 * vpls.capacity, 1), wp.int32)
+    order = scratch.array("gather.order", max(2 * vpls.capacity, 1), wp.int32)
+    parts = scratch.array("gather.parts", 2, VplSets)
     lights, surfaces = VplSets(), VplSets()
     blocks = []
     for lit, name, begin, end in (
@@ -238,10 +237,10 @@ def build_sets(vpls: Any, guide: Guide, launcher: Launcher) -> Any:
         most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
         blocks.append(most)
         lit.vpls, lit.order = vpls, order[begin:] if end > begin else order
-        lit.rows = launcher.scratch(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
-        lit.colors = launcher.scratch(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
+        lit.rows = scratch.array(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
+        lit.colors = scratch.array(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
         lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        lit.shapes = launcher.scratch(f"gather.{name}.shapes", max(SHAPING_ROWS * most * lit.shaped, 1), vec16)
+        lit.shapes = scratch.array(f"gather.{name}.shapes", max(SHAPING_ROWS * most * lit.shaped, 1), vec16)
     inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, parts]
     launcher.launch(_divide, max(vpls.capacity, 1), inputs)  # where nothing emits, that has to be said, too
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
