@@ -232,6 +232,22 @@ def _trace_primary(
         gbuffer.surface_point[pixel] = surface_point_of(sight.hit)
 
 
+@wp.func
+def reflecting_pixel(gbuffer: GBuffer, index: int) -> int:
+    """The pixel that index `index` of a launch stands for, if what it shows reflects light; else -1.
+
+    Estimators begin with this. Where a pixel of the film reflects nothing, its irradiance is set to 0 here.
+    """
+    pixel = pixel_at(gbuffer.tiles, index)
+    if pixel < 0:
+        return -1
+    if gbuffer.mesh[pixel] < 0 or wp.max(gbuffer.albedo[pixel]) <= 0.0:
+        gbuffer.normal_or_direct[pixel] = wp.vec3(0.0)
+        gbuffer.indirect[pixel] = wp.vec3(0.0)
+        return -1
+    return pixel
+
+
 def new_gbuffer(
     launcher: Launcher, columns: int, rows: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
 ) -> tuple[GBuffer, wp.array[wp.float32]]:

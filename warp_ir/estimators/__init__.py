@@ -1,9 +1,8 @@
-"""The ways to compute the light. Each is one file with one verb: add one iteration to a film.
+"""The estimators: ways to compute the light of one iteration, one file each.
 
-An estimator is built as ``Estimator(scene, camera, settings, scratch)`` from an uploaded scene and a
-`CameraData`, and then ``estimate(iteration, gbuffer)`` fills, for
-every pixel of the tiles of `gbuffer`, what the camera sees and its irradiance over π by way of the lights and by
-way of surfaces. What it computes depends on these arguments alone.
+An estimator is built as ``Estimator(scene, camera, settings, scratch)``. Then ``estimate(iteration, gbuffer)`` fills the
+G-buffer of one iteration: what the camera sees, and the direct and indirect irradiance over π there. The result depends
+on these arguments alone.
 """
 
 from collections.abc import Sequence

@@ -1,11 +1,11 @@
-"""Path tracing, the independent truth: from the eye, one path per pixel and iteration.
+"""Path tracing, the independent second opinion: one path per pixel and iteration, from the camera.
 
-At every vertex the lights are sampled once (next-event estimation), and the direction in which the path goes
-on may hit one as well; the two are weighted by the power heuristic (Veach 1997). Paths end by Russian
-roulette on the local albedo. It shares ray queries and scene tables with the VPLs, and no transport.
+At every vertex one light is sampled (next-event estimation), and the direction in which the path continues may hit an
+emitter as well; multiple importance sampling weighs the two by the power heuristic (Veach 1997). Paths end by Russian
+roulette on the local albedo. The estimator shares ray queries and scene tables with the VPLs, but no light transport.
 
-Surfaces are shaded with interpolated normals where the camera sees them, and with the triangles' own
-where light bounces between them, as the VPLs do: so energy is conserved and both compute the same integral.
+Shading normals count where the camera sees a surface, geometric normals where light is reflected between surfaces, as
+for the VPLs: so energy is conserved, and both compute the same integral.
 """
 
 import sys
@@ -19,7 +19,7 @@ import warp_ir.gbuffer
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, image_pixel, trace_primary
+from warp_ir.gbuffer import GBuffer, image_pixel, reflecting_pixel, trace_primary
 from warp_ir.lights import (
     DirectSample,
     intersect_lights,
@@ -32,7 +32,7 @@ from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest
-from warp_ir.tiles import indices, pixel_at
+from warp_ir.tiles import indices
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -46,22 +46,22 @@ def _reflected(
     normal: wp.vec3,
     shading_normal: wp.vec3,
     mesh: int,
-    seen: bool,
+    from_camera: bool,
     light: DirectSample,
 ) -> wp.vec3:
-    """Weighted irradiance over π at a point from one sample of the lights."""
+    """The MIS-weighted irradiance over π at a point from one sample of the lights."""
     at_point = wp.dot(shading_normal, light.direction)
     if at_point <= 0.0 or wp.max(light.radiance) <= 0.0 or wp.dot(normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    arrives = light_visibility(scene, light.modifiers, position, mesh, seen, light.target)
-    if wp.max(arrives) <= 0.0:
+    visibility = light_visibility(scene, light.modifiers, position, mesh, from_camera, light.target)
+    if wp.max(visibility) <= 0.0:
         return wp.vec3(0.0)
-    # The two ways to find this light are weighted by their densities; a delta light has only one (density 0).
-    by_bsdf = at_point / wp.pi
+    # A light without a pdf, such as a point light, is found by no ray: its sample has weight 1.
+    bsdf_pdf = at_point / wp.pi
     weight = float(1.0)
     if light.pdf > 0.0:
-        weight = power_heuristic(light.pdf, by_bsdf)
-    return wp.cw_mul(light.radiance, arrives) * (weight * by_bsdf)
+        weight = power_heuristic(light.pdf, bsdf_pdf)
+    return wp.cw_mul(light.radiance, visibility) * (weight * bsdf_pdf)
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
@@ -73,60 +73,60 @@ def _trace_paths(
     scramble: wp.uint32,
     max_bounces: int,
 ) -> None:
-    """Follows one path from what the camera sees at a pixel."""
-    pixel = pixel_at(gbuffer.tiles, first + wp.tid())
+    """Traces one path that begins at what the camera sees at a pixel."""
+    pixel = reflecting_pixel(gbuffer, first + wp.tid())
     if pixel < 0:
         return
-    once = wp.vec3(0.0)
-    more = wp.vec3(0.0)
-    if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0 and scene.emitter_count > 0:
-        stream = sobol.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
-        position = gbuffer.position[pixel]
-        normal = gbuffer.normal_or_direct[pixel]
-        shading_normal = gbuffer.shading_normal[pixel]
-        mesh = gbuffer.mesh[pixel]
-        throughput = wp.vec3(1.0)  # after the reflection at the pixel, which is the film's
-        bounce = int(0)  # reflections between this vertex's light and the camera, less one
-        dimension = int(0)
-        while wp.max(throughput) > 0.0:
-            u = sobol.sample_1d(scene.sobol, 0, dimension, stream)
-            u2 = sobol.sample_2d(scene.sobol, 0, dimension + 1, stream)
-            light = sample_direct(scene, position, u, u2)
-            lit = _reflected(scene, position, normal, shading_normal, mesh, bounce == 0, light)
-            found = wp.cw_mul(throughput, lit)
+    direct = wp.vec3(0.0)
+    indirect = wp.vec3(0.0)
+    stream = sobol.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
+    position = gbuffer.position[pixel]
+    normal = gbuffer.normal_or_direct[pixel]
+    shading_normal = gbuffer.shading_normal[pixel]
+    mesh = gbuffer.mesh[pixel]
+    # Without the reflection at the pixel itself, which the film multiplies by.
+    throughput = wp.vec3(wp.where(scene.emitter_count > 0, 1.0, 0.0))
+    bounce = int(0)  # reflections after the first
+    dimension = int(0)
+    while wp.max(throughput) > 0.0:
+        u = sobol.sample_1d(scene.sobol, 0, dimension, stream)
+        u2 = sobol.sample_2d(scene.sobol, 0, dimension + 1, stream)
+        light = sample_direct(scene, position, u, u2)
+        reflected = _reflected(scene, position, normal, shading_normal, mesh, bounce == 0, light)
+        radiance = wp.cw_mul(throughput, reflected)
 
-            # The way on: lights it meets count here, the surface it meets is the next vertex.
-            u2 = sobol.sample_2d(scene.sobol, 0, dimension + 3, stream)
-            direction = square_to_cosine_hemisphere(u2, shading_normal)
-            above = wp.dot(direction, normal) > 0.0
-            pdf = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
-            hit = closest(scene, position, direction, 3.0e38)
-            if above:
-                reach = wp.where(hit.triangle < 0, 3.0e38, hit.t)
-                seen = intersect_lights(scene, position, direction, reach, hit.triangle < 0, pdf, mesh)
-                if hit.triangle >= 0:
-                    seen += surface_emission_mis(scene, hit, direction, pdf, mesh)
-                found += wp.cw_mul(throughput, seen)
-            if bounce == 0:
-                once += found
-            else:
-                more += found
+        # The next direction: emission that it meets counts here; the surface that it hits is the next vertex.
+        u2 = sobol.sample_2d(scene.sobol, 0, dimension + 3, stream)
+        direction = square_to_cosine_hemisphere(u2, shading_normal)
+        above = wp.dot(direction, normal) > 0.0
+        pdf = wp.max(wp.dot(direction, shading_normal), 1.0e-20) / wp.pi
+        hit = closest(scene, position, direction, 3.0e38)
+        if above:
+            t_max = wp.where(hit.triangle < 0, 3.0e38, hit.t)
+            emitted = intersect_lights(scene, position, direction, t_max, hit.triangle < 0, pdf, mesh)
+            if hit.triangle >= 0:
+                emitted += surface_emission_mis(scene, hit, direction, pdf, mesh)
+            radiance += wp.cw_mul(throughput, emitted)
+        if bounce == 0:
+            direct += radiance
+        else:
+            indirect += radiance
 
-            bounce += 1
-            if bounce > max_bounces or hit.triangle < 0 or not above:
-                break
-            rho = albedo(scene, hit, scene.footprint)
-            survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
-            if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
-                break
-            throughput = wp.cw_mul(throughput, rho) / survival
-            position = hit.position
-            normal = hit.normal
-            shading_normal = hit.normal
-            mesh = scene.triangle_mesh[hit.triangle]
-            dimension += 6
-    gbuffer.normal_or_direct[pixel] = once
-    gbuffer.indirect[pixel] = more
+        bounce += 1
+        if bounce > max_bounces or hit.triangle < 0 or not above:
+            break
+        rho = albedo(scene, hit, scene.footprint)
+        survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
+        if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
+            break
+        throughput = wp.cw_mul(throughput, rho) / survival
+        position = hit.position
+        normal = hit.normal
+        shading_normal = hit.normal
+        mesh = scene.triangle_mesh[hit.triangle]
+        dimension += 6
+    gbuffer.normal_or_direct[pixel] = direct
+    gbuffer.indirect[pixel] = indirect
 
 
 class PathTracer:

@@ -1,15 +1,15 @@
-"""Progressive instant radiosity: Keller's VPLs, gathered with few rays, bounded and compensated.
+"""The default estimator: Keller's VPLs, gathered with few shadow rays, bounded and compensated.
 
-The sum over VPLs is estimated by `gather`. Its bound b on G takes energy away where surfaces come close to each
-other; that energy is put back by following one cosine-distributed ray (Kollig and Keller 2004):
+`gather` estimates the sum over VPLs. Its bound b on G takes away energy where surfaces come close to each other. One
+cosine-distributed ray per point compensates for that (Kollig and Keller 2004):
 
-    E(x) = Σ I min(G, b) V + ∫ L(y) (1 - b/G)⁺ cosθ dω,        y what the ray meets
+    E(x) = Σ I min(G, b) V + ∫ L(y) (1 - b/G)⁺ cosθ dω,        y what the ray hits
 
-The ray is as short as 1/√b, since G ≤ 1/d² cannot exceed b farther away, and most rays are short misses. What
-it meets has gathered in turn, and so on. Emission met on the way is the part that the bound took from the VPLs on
-that light, no more: nothing counts twice.
+Since G ≤ 1/d², G cannot exceed b beyond the distance 1/√b: the ray is no longer than that, and usually hits nothing.
+The point it hits gathers in turn, and so on. Emission that the ray meets counts with the clamped fraction (1 - b/G)⁺, which
+is exactly what the bound took from the VPLs on that emitter: nothing counts twice.
 
-The bound follows the density of the VPLs (`gather.build_sets`): no length in scene units is chosen anywhere.
+The bound follows from the density of the VPLs (`vpl.sets`): no length in scene units is chosen anywhere.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, trace_primary
+from warp_ir.gbuffer import GBuffer, reflecting_pixel, trace_primary
 from warp_ir.guiding import guiding_applies, learn
 from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest
-from warp_ir.tiles import indices, pixel_at
+from warp_ir.tiles import indices
 from warp_ir.vpl.emission import emit_vpls
 from warp_ir.vpl.gather import ShadingPoint, gather
 from warp_ir.vpl.guide import Guide, unguided
@@ -41,30 +41,30 @@ from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, build_sets
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _SHADOW_RAYS = (4, 4)
-"""Per pixel and iteration, to VPLs on lights and on surfaces: where the lights are hidden, surfaces still count."""
-_SHADOW_RAYS_AFTER = (2, 2)
-"""Where a compensation ray ends: such light has lost most of its weight."""
+"""Shadow rays per pixel and iteration, to VPLs on lights and to VPLs on surfaces."""
+_COMPENSATION_SHADOW_RAYS = (2, 2)
+"""Shadow rays at the end of a compensation ray, whose light has lost most of its weight."""
 _UNGUIDED_ITERATIONS = 4
-"""Iterations before those whose light paths are guided: for a picture of fewer, a pilot would take too long."""
+"""Number of first iterations without guiding: learning would take too large a part of a shorter render."""
 _ROULETTE_DEPTH = wp.constant(2)
-_INDEPENDENT = 0x5BD1E995  # parts the gathering's scramble from that of the light paths
+_GATHER_STREAM = 0x5BD1E995  # decorrelates gathering from the light paths
 
 
 @wp.struct
 class GatherSettings:
-    """What the gathering kernel needs to know beside the scene."""
+    """Parameters of the gathering kernel."""
 
-    first_column: int  # of the film in the image, as for `CameraData`
+    first_column: int  # of the film in the image, as in `CameraData`
     first_row: int
     scramble: wp.uint32
-    rays: wp.vec2i  # to lights and to surfaces
-    rays_after: wp.vec2i  # where a compensation ray ends
+    rays: wp.vec2i  # shadow rays to VPLs on lights and on surfaces
+    compensation_rays: wp.vec2i  # shadow rays at the end of a compensation ray
     max_bounces: int
 
 
 @wp.func
 def _spread(x: int) -> int:
-    """Sixteen bits, with a zero between any two."""
+    """The lowest sixteen bits of x, with a zero after each: one coordinate of a Morton code."""
     y = (x | (x << 8)) & 0x00FF00FF
     y = (y | (y << 4)) & 0x0F0F0F0F
     y = (y | (y << 2)) & 0x33333333
@@ -73,14 +73,15 @@ def _spread(x: int) -> int:
 
 @wp.func
 def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
-    """Along the Z-order curve a low-discrepancy sequence is stratified in every square of 2^k pixels."""
+    """The pixel's place on the Z-order curve, along which the sequence is stratified in squares of 2^k x 2^k pixels."""
     column = (settings.first_column + pixel % columns) & 0xFFFF
     row = (settings.first_row + pixel // columns) & 0xFFFF
     return _spread(column) | (_spread(row) << 1)
 
 
 @wp.func
-def _first_receiver(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
+def _camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
+    """The point that the camera sees at a pixel."""
     x = ShadingPoint()
     x.position = gbuffer.position[pixel]
     x.normal = gbuffer.normal_or_direct[pixel]
@@ -90,83 +91,82 @@ def _first_receiver(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
     return x
 
 
-@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # so that rays and lights are compiled once
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # shares compiled rays and lights
 def _gather_pixels(
     first: int,
     scene: SceneData,
     gbuffer: GBuffer,
-    parts: wp.array[VplSets],
+    vpl_sets: wp.array[VplSets],
     settings: GatherSettings,
 ) -> None:
-    """Irradiance over π of what one pixel sees."""
-    pixel = pixel_at(gbuffer.tiles, first + wp.tid())
+    """Computes the irradiance over π, direct and indirect, of one pixel."""
+    pixel = reflecting_pixel(gbuffer, first + wp.tid())
     if pixel < 0:
         return
-    once = wp.vec3(0.0)
-    more = wp.vec3(0.0)
-    if gbuffer.mesh[pixel] >= 0 and wp.max(gbuffer.albedo[pixel]) > 0.0:
-        index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
-        # Neighbours weigh different sets, as any coordinate of a point: nothing else that is sampled hangs on which.
-        which = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
-        x = _first_receiver(gbuffer, pixel)
-        throughput = wp.vec3(1.0)
-        bound = parts[ON_LIGHTS].bound  # the same for both
-        reach = 1.0 / wp.sqrt(bound.least)
-        depth = int(0)
-        rays = settings.rays
-        while depth <= settings.max_bounces:
-            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
-            bounces = settings.max_bounces - depth
-            by_lights = gather(scene.address, parts, ON_LIGHTS, which, x, u[0], rays[0], bounces)
-            by_surfaces = gather(scene.address, parts, ON_SURFACES, which, x, u[1], rays[1], bounces)
-            if depth == 0:
-                once = by_lights
-                more = by_surfaces
-            else:
-                more += wp.cw_mul(throughput, by_lights + by_surfaces)
+    direct = wp.vec3(0.0)
+    indirect = wp.vec3(0.0)
+    index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
+    # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
+    u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
+    x = _camera_vertex(gbuffer, pixel)
+    throughput = wp.vec3(1.0)
+    bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
+    radius = 1.0 / wp.sqrt(bound.least)  # of compensation: beyond it G cannot exceed the bound
+    depth = int(0)
+    rays = settings.rays
+    while depth <= settings.max_bounces:
+        u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
+        bounces = settings.max_bounces - depth
+        from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
+        from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
+        if depth == 0:
+            direct = from_lights
+            indirect = from_surfaces
+        else:
+            indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
 
-            v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
-            direction = square_to_cosine_hemisphere(v, x.shading_normal)
-            if wp.dot(direction, x.normal) <= 0.0:
+        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
+        direction = square_to_cosine_hemisphere(v, x.shading_normal)
+        if wp.dot(direction, x.normal) <= 0.0:
+            break
+        cosine = wp.dot(direction, x.shading_normal)
+        hit = closest(scene, x.position, direction, radius)
+        t_max = wp.where(hit.triangle < 0, radius, hit.t)
+        emitted = clamped_light_radiance(
+            scene, x.position, direction, t_max, cosine, bound, radius, x.mesh, x.from_camera
+        )
+        clamped = float(0.0)
+        if hit.triangle >= 0:
+            g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
+            clamped = clamped_fraction(bound.least, g)
+            if clamped > 0.0:
+                emitted += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
+        emitted = wp.cw_mul(throughput, emitted) * wp.pi
+        if depth == 0:
+            direct += emitted
+        else:
+            indirect += emitted
+        if clamped <= 0.0:
+            break
+        throughput = wp.cw_mul(throughput, albedo(scene, hit, scene.footprint)) * clamped
+        if depth > _ROULETTE_DEPTH:
+            survival = wp.min(wp.max(throughput), 0.99)
+            if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
                 break
-            cosine = wp.dot(direction, x.shading_normal)
-            hit = closest(scene, x.position, direction, reach)
-            near = wp.where(hit.triangle < 0, reach, hit.t)
-            found = clamped_light_radiance(
-                scene, x.position, direction, near, cosine, bound, reach, x.mesh, x.from_camera
-            )
-            cut = float(0.0)
-            if hit.triangle >= 0:
-                g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-                cut = clamped_fraction(bound.least, g)
-                if cut > 0.0:
-                    found += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
-            found = wp.cw_mul(throughput, found) * wp.pi
-            if depth == 0:
-                once += found
-            else:
-                more += found
-            if cut <= 0.0:
-                break
-            throughput = wp.cw_mul(throughput, albedo(scene, hit, scene.footprint)) * cut
-            if depth > _ROULETTE_DEPTH:
-                survival = wp.min(wp.max(throughput), 0.99)
-                if wp.frac(v[0] * 1024.0) >= survival:
-                    break
-                throughput = throughput / survival
-            x.position = hit.position
-            x.normal = hit.normal
-            x.shading_normal = hit.normal
-            x.mesh = scene.triangle_mesh[hit.triangle]
-            x.from_camera = False
-            rays = settings.rays_after
-            depth += 1
-    gbuffer.normal_or_direct[pixel] = once / wp.pi
-    gbuffer.indirect[pixel] = more / wp.pi
+            throughput = throughput / survival
+        x.position = hit.position
+        x.normal = hit.normal
+        x.shading_normal = hit.normal
+        x.mesh = scene.triangle_mesh[hit.triangle]
+        x.from_camera = False
+        rays = settings.compensation_rays
+        depth += 1
+    gbuffer.normal_or_direct[pixel] = direct / wp.pi
+    gbuffer.indirect[pixel] = indirect / wp.pi
 
 
 class VplEstimator:
-    """Few shadow rays, resampled; bounded and compensated."""
+    """VPLs with resampled visibility, bounded and compensated; light paths are guided."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.vpl.sets)
 
@@ -177,7 +177,7 @@ class VplEstimator:
         self._unguided = unguided(scene, scratch.launcher)
         self._guide: Guide | None = self._unguided
         if guiding_applies(scene):
-            self._guide = None  # to be learned
+            self._guide = None  # learned later
             if settings.iteration_limit > _UNGUIDED_ITERATIONS:
                 scratch.launcher.load([warp_ir.guiding.probes])
 
@@ -186,11 +186,11 @@ class VplEstimator:
         settings, launcher = self._settings, self._launcher
         scramble = sobol.iteration_scramble(settings.seed, iteration)
 
-        def look() -> None:
+        def trace_camera() -> None:
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
 
         guide = self._guide_of(iteration)
-        with launcher.overlap("primary", look), launcher.phase("emission"):
+        with launcher.overlap("primary", trace_camera), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
                 self._scratch,
@@ -199,24 +199,24 @@ class VplEstimator:
                 max_bounces=settings.max_bounces,
                 scramble=scramble,
             )
-            parts = build_sets(vpls, guide, self._scratch)
-        how = GatherSettings()
-        how.first_column, how.first_row = self._camera.first_column, self._camera.first_row
-        how.scramble = wp.uint32(scramble ^ _INDEPENDENT)
-        how.rays, how.rays_after = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_SHADOW_RAYS_AFTER)
-        how.max_bounces = settings.max_bounces
+            vpl_sets = build_sets(vpls, guide, self._scratch)
+        gathering = GatherSettings()
+        gathering.first_column, gathering.first_row = self._camera.first_column, self._camera.first_row
+        gathering.scramble = wp.uint32(scramble ^ _GATHER_STREAM)
+        gathering.rays, gathering.compensation_rays = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_COMPENSATION_SHADOW_RAYS)
+        gathering.max_bounces = settings.max_bounces
         with launcher.phase("gather"):
             launcher.launch(
                 _gather_pixels,
                 indices(gbuffer.tiles),
-                [guide.scene.data, gbuffer, parts, how],
+                [guide.scene.data, gbuffer, vpl_sets, gathering],
             )
 
     def _guide_of(self, iteration: int) -> Guide:
-        """Where the light paths of an iteration go."""
+        """The guide of an iteration's light paths; it is learned when it is first needed."""
         if iteration < _UNGUIDED_ITERATIONS:
             return self._unguided
         if self._guide is None:
-            with self._launcher.phase("pilot"):
+            with self._launcher.phase("guiding"):
                 self._guide = learn(self._scene, self._camera, self._launcher, self._settings)
         return self._guide

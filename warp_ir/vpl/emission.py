@@ -1,12 +1,13 @@
-"""Light paths and the virtual point lights (VPLs) at their vertices (Keller 1997).
+"""Emission: light paths, and the virtual point lights (VPLs) at their vertices (Keller 1997).
 
-A path starts at a random point of a random light and is reflected diffusely until it ends. Each of its
-vertices is a VPL: the one on the light itself carries direct light (bounce 0), the one after j
-reflections the j-th term of the Neumann series. With Φ the flux of the path on arrival,
+A light path starts at a random point of a random emitter and is reflected diffusely until it ends. Each of its vertices
+is a VPL: the one on the emitter carries direct light (bounce 0), the one after j reflections the j-th term of the
+Neumann series. With Φ the flux [W] that arrives at a vertex y of albedo ρ,
 
     I = Φ ρ/π  [W/sr]        L(x) = ρ(x)/π Σ I G(x, y) V(x, y)        G = cos⁺θ_x cos⁺θ_y / |x - y|²
 
-A VPL lights the side its normal faces and no other. Power is divided by the paths started, not the VPLs kept.
+A VPL lights only the side that its normal faces. The flux is divided by the number of light paths started, not by the
+number of VPLs stored.
 """
 
 import math
@@ -27,113 +28,114 @@ from warp_ir.vpl.guide import Guide, VplImportance, survival_probability
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MAX_SURVIVAL = 0.999
-"""Roulette lets no more than this survive, so that paths end even where nothing absorbs."""
+"""Largest survival probability of Russian roulette, so that paths end even where nothing absorbs."""
 _MAX_SURVIVAL = wp.constant(MAX_SURVIVAL)
 _MAX_REFLECTIVITY = 0.98
-"""Likewise the mean reflectivity of fractional absorption."""
-# Dimensions 0-1: where on the light (the best pair), 2: which light, 3-4: direction, 5-6: place of a distant photon.
+"""Largest mean reflectivity of fractional absorption, for the same reason."""
+# Sample dimensions: 0-1 point on the emitter (the best pair), 2 which emitter, 3-4 direction, 5-6 where a photon of a
+# light at infinity enters the scene, then three for every bounce: direction and roulette.
 _FIRST_BOUNCE_DIMENSION = wp.constant(7)
-_LANDING_DIMENSION = wp.constant(1 << 20)  # far from those of any bounce
-_KEEPING = wp.constant(wp.uint32(0x9E6C63D0))  # parts the coins by which VPLs are kept from the paths' sequence
+_FIRST_REFLECTION_DIMENSION = wp.constant(1 << 20)  # far from the dimensions of any bounce
+_SURVIVAL_STREAM = wp.constant(wp.uint32(0x9E6C63D0))  # decorrelates the survival of VPLs from the light paths
+_THINNING_STREAM = wp.constant(wp.uint32(0x7FEB352D))  # decorrelates the thinning of VPLs from the light paths
 _RETRACED_SHARE = 0.02
-"""About the share of the paths that may be longer than what is noted of them."""
+"""Approximate share of the light paths that are longer than what is recorded of them."""
 _MAX_RECORDED = 2**22
-"""Reflections noted at most, 48 bytes each."""
+"""Largest number of recorded reflections, 48 bytes each."""
 _CAPACITY_PER_PATH = 8
-"""VPLs on surfaces for which there is room, per path at least: the mean where 8/9 of the light is reflected."""
+"""Least capacity for VPLs on surfaces, per light path: their mean number where 8/9 of the light is reflected."""
 _MAX_CAPACITY = 2**26
-"""VPLs on surfaces at most, 64 bytes each."""
-_THINNING = wp.constant(wp.uint32(0x7FEB352D))  # parts the choice of those that find room from the paths' sequence
+"""Largest capacity for VPLs on surfaces, 64 bytes each."""
 
 
 @wp.struct
 class VplBuffer:
-    """VPLs in the scene's device frame, first those on lights, then those on surfaces, path by path.
+    """VPLs in the scene's device frame: first those on lights, then those on surfaces, path by path.
 
-    Positions and normals are homogeneous, as in `lights`. How many there are, the device alone knows: the host would
-    have to wait for it.
+    Positions and normals are homogeneous, as `lights` defines them. Only the device knows how many VPLs there are: the
+    host would have to wait for the number.
     """
 
-    count: wp.array[wp.int32]  # one row
-    capacity: int  # at least `count`; the same on the CPU, where reading it costs nothing
-    on_lights: int
+    count: wp.array[wp.int32]  # [1], number of VPLs
+    capacity: int  # rows available, at least `count`; equal on the CPU, where reading `count` is free
+    on_lights: int  # number of VPLs on lights
     position: wp.array[wp.vec4]
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
-    bounce: wp.array[wp.int32]
-    pdf_area: wp.array[wp.float32]  # [on_lights], of samples per area of the light; 0 where it has no area
-    modifiers: wp.array[wp.int32]  # [on_lights], rows of the lights' `LightModifiers`s or -1; one row if there are none
+    bounce: wp.array[wp.int32]  # reflections before the VPL; 0 on lights
+    pdf_area: wp.array[wp.float32]  # [on_lights], of the point per area of the light [1/area]; 0 where it has no area
+    modifiers: wp.array[wp.int32]  # [on_lights], row of the light's `LightModifiers`, or -1; one row if none has any
 
 
 @wp.struct
-class PathSettings:
-    """How light paths are sampled and how they end."""
+class LightPathSettings:
+    """How light paths are sampled, how they end, and how many of their VPLs can be stored."""
 
     scramble: wp.uint32
-    paths: int
-    on_lights: int  # of them, whose point on the light is a VPL
+    paths: int  # light paths started
+    on_lights: int  # the first of them, whose point on the light is stored as a VPL
     max_bounces: int
-    fractional: int  # 1: the first survivors[j] paths are reflected j times; 0: roulette by the local albedo
-    survivors: wp.array[wp.int32]
-    levels: int  # length of survivors
-    recorded: int  # VPLs of a path that are noted while it is traced
-    capacity: int  # for VPLs on surfaces; if there are more, some are drawn to stand for all
+    fractional: int  # 1: fractional absorption by `survivors`; 0: Russian roulette by the local albedo
+    survivors: wp.array[wp.int32]  # [levels], number of paths that are reflected j times
+    levels: int
+    recorded: int  # VPLs of a path that are recorded while it is traced
+    capacity: int  # for VPLs on surfaces; if there are more, an even selection of them stands for all
     photon_target: PhotonTarget
     importance: VplImportance
 
 
 @wp.func
 def _survival_sample(scramble: wp.uint32, path: int, bounce: int) -> float:
-    """Uniform in [0, 1), for every VPL."""
-    bits = sobol.hash_combine(sobol.hash_combine(scramble ^ _KEEPING, wp.uint32(path)), wp.uint32(bounce))
+    """A uniform number in [0, 1) for each VPL, independent of the light path's own samples."""
+    bits = sobol.hash_combine(sobol.hash_combine(scramble ^ _SURVIVAL_STREAM, wp.uint32(path)), wp.uint32(bounce))
     return sobol.to_unit(bits)
 
 
 @wp.func
-def _row(settings: PathSettings, number: int, total: int) -> int:
-    """The row of VPL `number` of `total` on surfaces; -1: it is dropped, where there is no room for all of them.
+def _surface_row(settings: LightPathSettings, number: int, total: int) -> int:
+    """The row of VPL `number` of `total` on surfaces; -1: it is dropped, because not all of them can be stored.
 
-    Those that are kept lie evenly among the others, and each is kept with the same probability (systematic sampling).
+    Systematic sampling: the stored VPLs are spread evenly, and each is stored with the same probability.
     """
     if total <= settings.capacity:
         return settings.on_lights + number
-    offset = sobol.hash_combine(settings.scramble ^ _THINNING, wp.uint32(0)) % wp.uint32(total)
+    offset = sobol.hash_combine(settings.scramble ^ _THINNING_STREAM, wp.uint32(0)) % wp.uint32(total)
     before = (wp.int64(number) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     after = (wp.int64(number + 1) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     return wp.where(after > before, settings.on_lights + int(before), -1)
 
 
 @wp.func
-def _thinning_weight(settings: PathSettings, total: int) -> float:
-    """How many of `total` VPLs each of those stands for that are kept."""
+def _thinning_weight(settings: LightPathSettings, total: int) -> float:
+    """Factor of a stored VPL's intensity that makes up for the VPLs that could not be stored."""
     if total <= settings.capacity:
         return 1.0
     return float(total) / float(settings.capacity)
 
 
 @wp.func(inline=False)
-def _follow(
+def _trace_light_path(
     address: wp.uint64,
-    settings: PathSettings,
+    settings: LightPathSettings,
     i: int,
     vpls: VplBuffer,
     number: int,
     step: int,
     total: int,
-    kept: int,
-    most: int,
+    stored: int,
+    end: int,
 ) -> int:
-    """Follows path `i` and returns how many VPLs it leaves on surfaces.
+    """Traces light path `i` and returns its number of VPLs on surfaces.
 
-    Its point on the light goes to row i of `vpls`; the first of the others is VPL `number` of `total`, the next ones
-    follow in steps. VPL j is stored if kept < j <= most.
+    The point on the light is stored in row i of `vpls`. The first VPL on a surface is number `number` of `total`, the
+    next ones follow at distances of `step`. The path's j-th VPL on a surface is stored if stored < j <= end.
     """
     scene = scene_at(address)[0]
     u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble)
     u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
-    share = 1.0 / float(settings.paths)
-    if kept == 0 and i < settings.on_lights:
+    path_weight = 1.0 / float(settings.paths)
+    if stored == 0 and i < settings.on_lights:
         vpls.position[i] = light.position
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
@@ -154,12 +156,12 @@ def _follow(
     flux = photon.flux
     dimension = int(_FIRST_BOUNCE_DIMENSION)
     bounce = int(1)
-    left = int(0)
+    vpl_count = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
         if bounce == 1 and light.modifiers >= 0:
-            coin = sobol.sample_1d(scene.sobol, i, _LANDING_DIMENSION, settings.scramble)
-            landing = first_reflection(scene, light.modifiers, hit, direction, coin)
+            u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble)
+            landing = first_reflection(scene, light.modifiers, hit, direction, u_mesh)
             hit = landing.hit
             flux = flux * landing.weight
         if hit.triangle < 0:
@@ -168,7 +170,7 @@ def _follow(
         if settings.fractional == 1:
             if bounce >= settings.levels or i >= settings.survivors[wp.min(bounce, settings.levels - 1)]:
                 break
-            share = 1.0 / float(settings.survivors[bounce])
+            path_weight = 1.0 / float(settings.survivors[bounce])
             flux = wp.cw_mul(flux, rho)
         else:
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
@@ -177,16 +179,16 @@ def _follow(
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
             break
-        intensity = flux * (share / wp.pi)
+        intensity = flux * (path_weight / wp.pi)
         survives = bool(True)
         if settings.importance.known == 1:
             probability = survival_probability(settings.importance, hit.position, hit.normal, intensity)
             intensity = intensity / probability
             survives = _survival_sample(settings.scramble, i, bounce) < probability
         if survives:
-            left += 1
-            if left > kept and left <= most:
-                row = _row(settings, number + (left - 1) * step, total)
+            vpl_count += 1
+            if vpl_count > stored and vpl_count <= end:
+                row = _surface_row(settings, number + (vpl_count - 1) * step, total)
                 if row >= 0:
                     vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
@@ -197,16 +199,19 @@ def _follow(
         direction = square_to_cosine_hemisphere(u, hit.normal)
         dimension += 3
         bounce += 1
-    return left
+    return vpl_count
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_paths(
-    first: int, scene: SceneData, settings: PathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
+    first: int, scene: SceneData, settings: LightPathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
 ) -> None:
-    """Follows path `i` and notes its light and its first VPLs on surfaces, those of all paths side by side."""
+    """Traces light path `i`, and records its point on the light and its first VPLs on surfaces.
+
+    Row `on_lights + k paths + i` of `traced` is the path's k-th VPL on a surface.
+    """
     i = first + wp.tid()
-    lengths[i] = _follow(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.recorded)
+    lengths[i] = _trace_light_path(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.recorded)
 
 
 @wp.func
@@ -221,19 +226,19 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
 def _store_paths(
     first: int,
     scene: SceneData,
-    settings: PathSettings,
+    settings: LightPathSettings,
     traced: VplBuffer,
     lengths: wp.array[wp.int32],
     ends: wp.array[wp.int32],
     vpls: VplBuffer,
     counted: wp.array[wp.int64],
 ) -> None:
-    """Puts path `i` where it belongs: its light in row i, its other VPLs behind those of the paths before it."""
+    """Stores light path `i`: its point on the light in row i, its other VPLs after those of the paths before it."""
     i = first + wp.tid()
     total = ends[settings.paths - 1]
     number = ends[i] - lengths[i]
     for k in range(wp.min(lengths[i], settings.recorded)):
-        row = _row(settings, number + k, total)
+        row = _surface_row(settings, number + k, total)
         if row >= 0:
             _copy(traced, settings.on_lights + settings.paths * k + i, vpls, row, _thinning_weight(settings, total))
     if i < settings.on_lights:
@@ -242,14 +247,17 @@ def _store_paths(
         if scene.modifier_count > 0:
             vpls.modifiers[i] = traced.modifiers[i]
     if lengths[i] > settings.recorded:
-        _follow(scene.address, settings, i, vpls, number, 1, total, settings.recorded, lengths[i])
+        _trace_light_path(scene.address, settings, i, vpls, number, 1, total, settings.recorded, lengths[i])
     if i == settings.paths - 1:
         vpls.count[0] = settings.on_lights + wp.min(total, settings.capacity)
         counted[0] += wp.int64(vpls.count[0])
 
 
 def survivors(paths: int, mean_albedo: float) -> npt.NDArray[np.int32]:
-    """Fractional absorption: ⌊ρ̄ʲ N⌋ of N paths are reflected j times; int32 [levels], until none is left."""
+    """Fractional absorption (Keller 1997): ⌊ρ̄ʲ N⌋ of N paths are reflected j times.
+
+    Returns int32 [levels], which ends before the first 0.
+    """
     rho = min(mean_albedo, _MAX_REFLECTIVITY)
     if not rho > 0.0:
         return np.array([paths], np.int32)
@@ -268,24 +276,24 @@ def emit_vpls(
     max_bounces: int,
     scramble: int,
 ) -> VplBuffer:
-    """Traces light paths and returns the `VplBuffer` of all their vertices; none if nothing emits.
+    """Traces light paths and returns the VPLs at all their vertices; none if nothing emits.
 
-    Its arrays belong to `scratch`, have room to spare, and are overwritten by the next call with it.
+    The arrays belong to `scratch`, may be longer than needed, and are overwritten by the next call with it.
 
     Args:
-        guide: The uploaded scene, and where in it paths go.
-        scratch: Owns the buffer's arrays, and says where to run.
-        paths: VPLs on lights; as many light paths are started, times those of the guide.
+        guide: The uploaded scene, and the probabilities by which light paths are guided.
+        scratch: Owner of the buffer's arrays; its launcher runs the kernels.
+        paths: Number of VPLs on lights; `guide.paths` times as many light paths are started.
         absorption: "fractional" or "roulette".
-        max_bounces: Longest chain of reflections.
-        scramble: 32-bit scramble of the sequence: another one is an independent estimate.
+        max_bounces: Largest number of reflections of a light path.
+        scramble: 32-bit scramble of the low-discrepancy sequence; two scrambles give independent estimates.
     """
     scene, launcher, on_lights = guide.scene, scratch.launcher, paths
     if not scene.emits:
         vpls = _buffer(scene, scratch, "vpls", 0, 0)
         vpls.count.zero_()
         return vpls
-    settings = PathSettings()
+    settings = LightPathSettings()
     settings.scramble = wp.uint32(scramble)
     paths *= guide.paths
     settings.paths, settings.on_lights = paths, on_lights
@@ -300,7 +308,8 @@ def emit_vpls(
     settings.recorded = min(recorded, max_bounces)
     settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
-    # Traced first, and stored when all lengths are known: so every path has its rows without an atomic, and no limit.
+    # Two passes: paths are stored when the lengths of all are known. So every path has its rows without atomics, and no
+    # path has a maximal length; the few that are longer than what was recorded of them are traced again.
     lengths, ends = scratch.array("lengths", paths, wp.int32), scratch.array("ends", paths, wp.int32)
     traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
@@ -313,7 +322,7 @@ def emit_vpls(
 
 
 def _recorded_length(paths: int, mean_albedo: float) -> int:
-    """Reflections to note of every path: few paths go on after them, which then have to be followed again."""
+    """Number of reflections to record of every path, so that only `_RETRACED_SHARE` of the paths are longer."""
     rho = min(max(mean_albedo, 0.05), 0.95)
     return max(min(math.ceil(math.log(_RETRACED_SHARE) / math.log(rho)), _MAX_RECORDED // paths), 1)
 

@@ -1,14 +1,15 @@
-"""Gathering: the unbiased light of many VPLs at one point for the price of a few shadow rays.
+"""Gathering: an unbiased estimate of the light of many VPLs at one point, for the cost of a few shadow rays.
 
-At a point x, f_k = I_k min(G(x, y_k), b_k) is what VPL k gives if it is visible; the f are cheap, visibility is dear.
+VPL k contributes f_k V_k to a point x, with f_k = I_k min(G(x, y_k), b_k) and the visibility V_k, 0 or 1. Evaluating
+f_k is cheap; V_k costs a ray.
 
-* **Weigh in blocks.** Sixteen VPLs side by side are weighed in vector registers; on CUDA a thread weighs one at a time.
-* **Resample visibility.** M of the VPLs are chosen in proportion to f and only they get a shadow ray, each
-  standing for S/M, S being the sum of all f: unbiased (systematic resampling along a curve through space; Talbot
-  et al. 2005 for the idea).
-* **Interleave.** The VPLs come in sets, and a pixel weighs one of them, its neighbours another (Keller and Heidrich
-  2001): the cost of a pixel does not grow with the number of VPLs.
-* **Bound.** min(G, b) takes away the weak singularity; what it takes is given back by `estimators.vpl`.
+* **Evaluate in blocks.** Sixteen VPLs are evaluated at once in vector registers; a CUDA thread evaluates one at a time.
+* **Resample visibility.** M VPLs are drawn in proportion to f, and only they get a shadow ray. With S = Σ f, each
+  contributes V S/M, which is unbiased (resampled importance sampling, Talbot et al. 2005; here the M draws are
+  systematic along a curve through space).
+* **Interleave.** The VPLs are divided into sets; a pixel evaluates one set, its neighbours evaluate others (Keller and
+  Heidrich 2001). So the cost of a pixel does not grow with the number of VPLs.
+* **Bound.** min(G, b) removes the weak singularity of G. `estimators.vpl` compensates for what this takes away.
 """
 
 import warp as wp
@@ -18,28 +19,38 @@ from warp_ir.device_scene import SceneData
 from warp_ir.light_modifiers import approximate_shaping
 from warp_ir.lights import light_visibility
 from warp_ir.surface import scene_at
-from warp_ir.vpl.sets import BLOCK_ROWS, LANES, SHAPING_ROWS, VplSets, bound_of, color_of, luminance, vec16, vec16i
+from warp_ir.vpl.sets import (
+    BLOCK_ROWS,
+    LANES,
+    SHAPING_ROWS,
+    VplSets,
+    bound_of,
+    intensity_and_bounce,
+    mean_channel,
+    vec16,
+    vec16i,
+)
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _LANES = wp.constant(LANES)
-_MOST_RAYS = wp.constant(8)
+_MAX_RAYS = wp.constant(8)
 
 
 @wp.struct
 class ShadingPoint:
-    """A surface point that gathers."""
+    """A surface point that receives light, with its geometric normal and its shading normal."""
 
     position: wp.vec3
     normal: wp.vec3  # geometric
     shading_normal: wp.vec3
     mesh: int
-    from_camera: bool  # by the camera
+    from_camera: bool  # whether the camera sees the point
 
 
 @wp.func
 def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, bound: float) -> float:
-    """min(G, bound) between a receiver and a VPL; 0 behind the surface, whatever its interpolated normal says."""
+    """min(G, bound) between a point and a VPL; 0 behind the surface, even where the shading normal faces the VPL."""
     to_vpl = wp.vec3(position[0], position[1], position[2]) - x.position * position[3]
     squared = wp.dot(to_vpl, to_vpl) + 1.0e-30
     inverse = 1.0 / wp.sqrt(squared)
@@ -70,14 +81,14 @@ def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, b
     }
     return f;
 """)
-def _weigh(rows: wp.array[vec16], first: int, x: ShadingPoint) -> vec16:
-    """Luminance of f for the sixteen VPLs of a block: `bounded_geometry_term` in lanes, without a branch."""
+def _block_bounded_geometry(rows: wp.array[vec16], first: int, x: ShadingPoint) -> vec16:
+    """Mean channel of f for the sixteen VPLs of a block: `bounded_geometry_term` in lanes, without branches."""
     ...
 
 
 @wp.func_native("""
     const wp::vec_t<16, float>* b = rows.data + first;
-    const wp::vec_t<16, float>* s = shapes.data + first_shape;
+    const wp::vec_t<16, float>* s = shaping.data + first_shaping_row;
     wp::vec_t<16, float> out;
     for (int i = 0; i < 16; ++i) {
         const float w = b[3][i];
@@ -92,18 +103,21 @@ def _weigh(rows: wp.array[vec16], first: int, x: ShadingPoint) -> vec16:
     return out;
 """)
 def _block_shaping(
-    rows: wp.array[vec16], first: int, shapes: wp.array[vec16], first_shape: int, x: ShadingPoint
+    rows: wp.array[vec16], first: int, shaping: wp.array[vec16], first_shaping_row: int, x: ShadingPoint
 ) -> vec16:
-    """What shaping makes of the weights of a block."""
+    """The approximate shaping factors of the sixteen VPLs of a block, all on lights."""
     ...
 
 
 @wp.func
-def _block_weights(lit: VplSets, block: int, x: ShadingPoint) -> vec16:
-    f = _weigh(lit.rows, BLOCK_ROWS * block, x)
-    if lit.shaped == 1:
-        f = wp.cw_mul(f, _block_shaping(lit.rows, BLOCK_ROWS * block, lit.shapes, SHAPING_ROWS * block, x))
-    return f
+def _block_weights(group: VplSets, block: int, x: ShadingPoint) -> vec16:
+    """The weights f of the sixteen VPLs of a block, with the approximate shaping of lights."""
+    contributions = _block_bounded_geometry(group.rows, BLOCK_ROWS * block, x)
+    if group.shaped == 1:
+        contributions = wp.cw_mul(
+            contributions, _block_shaping(group.rows, BLOCK_ROWS * block, group.shaping, SHAPING_ROWS * block, x)
+        )
+    return contributions
 
 
 @wp.func_native("""
@@ -114,13 +128,16 @@ def _block_weights(lit: VplSets, block: int, x: ShadingPoint) -> vec16:
         passed += sums[i];
     }
     for (int i = 0; i < 16; ++i) {
-        const float target = (ceilf(out[i] / share - u) + u) * share - out[i];
+        const float target = (ceilf(out[i] / per_ray - u) + u) * per_ray - out[i];
         out[i] = target > 0.0f ? target : 0.0f;
     }
     return out;
 """)
-def _first_targets(sums: vec16, share: float, u: float) -> vec16:
-    """Of the targets (0, 1, 2, ... + u) share along all lanes the first in every lane, from where the lane begins."""
+def _first_targets(sums: vec16, per_ray: float, u: float) -> vec16:
+    """The first target in every lane, relative to the lane's begin.
+
+    Targets lie at (k + u) S/M, k = 0, 1, 2, ..., along the running sum of all lanes, one lane after the other.
+    """
     ...
 
 
@@ -130,7 +147,7 @@ def _first_targets(sums: vec16, share: float, u: float) -> vec16:
     return out;
 """)
 def _count_below(sum: vec16, target: vec16, count: vec16i) -> vec16i:
-    """One more in every lane whose running sum has not passed its target."""
+    """Adds one to the count of every lane whose running sum has not passed its target."""
     ...
 
 
@@ -145,103 +162,114 @@ def _sum(v: vec16) -> float: ...
 @wp.func
 def _shadowed_contribution(
     scene: SceneData,
-    lit: VplSets,
+    group: VplSets,
     x: ShadingPoint,
     slot: int,
     position: wp.vec4,
-    color: wp.vec4,
-    share: float,
-    most: int,
+    intensity_bounce: wp.vec4,
+    per_ray: float,
+    max_bounce: int,
 ) -> wp.vec3:
-    """What the chosen VPL gives: `share` (= S/M) in its `color`, if it is visible and of at most `most` bounces."""
-    if int(color[3]) > most:
+    """The contribution of a drawn VPL: its colour times V S/M; 0 if it has more than `max_bounce` bounces."""
+    if int(intensity_bounce[3]) > max_bounce:
         return wp.vec3(0.0)
     modifiers = int(-1)
     if scene.modifier_count > 0:
-        vpl = lit.order[slot]
-        if vpl < lit.vpls.on_lights:
-            modifiers = lit.vpls.modifiers[vpl]
-    arrives = light_visibility(scene, modifiers, x.position, x.mesh, x.from_camera, position)
-    if modifiers >= 0:  # it was weighed with this factor
-        arrives = arrives / approximate_shaping(scene.light_tables[0].modifiers.rows[modifiers], x.position, position)
-    intensity = wp.vec3(color[0], color[1], color[2])
-    return wp.cw_mul(intensity, arrives) * (share / luminance(intensity))
+        vpl = group.order[slot]
+        if vpl < group.vpls.on_lights:
+            modifiers = group.vpls.modifiers[vpl]
+    visibility = light_visibility(scene, modifiers, x.position, x.mesh, x.from_camera, position)
+    if modifiers >= 0:  # the approximate factor is part of f already
+        visibility = visibility / approximate_shaping(
+            scene.light_tables[0].modifiers.rows[modifiers], x.position, position
+        )
+    intensity = wp.vec3(intensity_bounce[0], intensity_bounce[1], intensity_bounce[2])
+    return wp.cw_mul(intensity, visibility) * (per_ray / mean_channel(intensity))
 
 
 @wp.func(inline=False)
 def gather(
     address: wp.uint64,
-    parts: wp.array[VplSets],
-    part: int,
-    which: float,
+    vpl_sets: wp.array[VplSets],
+    kind: int,
+    u_set: float,
     x: ShadingPoint,
     u: float,
     rays: int,
     max_bounce: int,
 ) -> wp.vec3:
-    """Irradiance [W m⁻²] at a receiver by the VPLs of all sets, estimated from one of them with some shadow rays.
+    """Irradiance [W m⁻²] at a point from the VPLs of all sets, estimated from one set with a few shadow rays.
 
-    `address` is that of the scene, `part` is `ON_LIGHTS` or `ON_SURFACES`. `which` in [0, 1) chooses the set, `u` in
-    [0, 1) is the offset of the systematic choice of VPLs. Those of more than `max_bounce` reflections are dark. `rays`
-    is 8 at most.
+    `address` is `SceneData.address`; `kind` is `ON_LIGHTS` or `ON_SURFACES`. `u_set` in [0, 1) selects the set, `u` in
+    [0, 1) is the offset of the systematic sampling. VPLs of more than `max_bounce` bounces contribute nothing. `rays`
+    is the number M of shadow rays, at most 8.
     """
     scene = scene_at(address)[0]
-    lit = parts[part]
-    chosen = int(which * float(lit.sets))
+    group = vpl_sets[kind]
+    set_index = int(u_set * float(group.sets))
     if on_cuda():
-        return _gather_one_by_one(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
-    return _gather_in_blocks(scene, lit, chosen, x, u, rays, max_bounce) * float(lit.sets)
+        return _gather_one_by_one(scene, group, set_index, x, u, rays, max_bounce) * float(group.sets)
+    return _gather_in_blocks(scene, group, set_index, x, u, rays, max_bounce) * float(group.sets)
 
 
 @wp.func
 def _gather_in_blocks(
-    scene: SceneData, lit: VplSets, chosen: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
+    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
-    """Every lane is a part of the set's curve; the M targets lie along one lane after the other."""
+    """Two passes over the blocks of a set: the first sums the lanes, the second finds the VPLs at the targets.
+
+    The M targets lie along one lane after the other; a lane is a section of the set's Z-order curve.
+    """
     out = wp.vec3(0.0)
-    begin = chosen * lit.blocks
+    begin = set_index * group.blocks
     sums = vec16()
-    for block in range(begin, begin + lit.blocks):
-        sums += _block_weights(lit, block, x)
+    for block in range(begin, begin + group.blocks):
+        sums += _block_weights(group, block, x)
     total = _sum(sums)
     if total <= 0.0:
         return out
-    share = total / float(rays)
-    # The first target in every lane is looked for in all at once. More in a lane are rare, or few VPLs give much.
-    target = _first_targets(sums, share, u)
+    per_ray = total / float(rays)
+    # The first target of every lane is found in all lanes at once. Further targets in a lane are rare, unless few VPLs
+    # contribute nearly everything.
+    target = _first_targets(sums, per_ray, u)
     running = vec16()
     count = vec16i()
-    for block in range(begin, begin + lit.blocks):
-        running += _block_weights(lit, block, x)
+    for block in range(begin, begin + group.blocks):
+        running += _block_weights(group, block, x)
         count = _count_below(running, target, count)
     passed = float(0.0)
-    drawn = int(0)
+    rays_drawn = int(0)
     for lane in range(_LANES):
         k = count[lane]
-        goal = target[lane]
-        while drawn < rays and (float(drawn) + u) * share < passed + sums[lane]:
-            if goal > target[lane]:
-                k = _count_in_lane(lit, begin, lane, x, goal)
-            slot = _LANES * begin + lit.blocks * lane + k
-            if k < lit.blocks and slot < lit.count:
+        next_target = target[lane]
+        while rays_drawn < rays and (float(rays_drawn) + u) * per_ray < passed + sums[lane]:
+            if next_target > target[lane]:
+                k = _count_in_lane(group, begin, lane, x, next_target)
+            slot = _LANES * begin + group.blocks * lane + k
+            if k < group.blocks and slot < group.count:
                 row = BLOCK_ROWS * (begin + k)
                 p = wp.vec4(
-                    lit.rows[row][lane], lit.rows[row + 1][lane], lit.rows[row + 2][lane], lit.rows[row + 3][lane]
+                    group.rows[row][lane],
+                    group.rows[row + 1][lane],
+                    group.rows[row + 2][lane],
+                    group.rows[row + 3][lane],
                 )
-                out += _shadowed_contribution(scene, lit, x, slot, p, lit.colors[slot], share, max_bounce)
-            goal += share
-            drawn += 1
+                out += _shadowed_contribution(
+                    scene, group, x, slot, p, group.intensity_bounce[slot], per_ray, max_bounce
+                )
+            next_target += per_ray
+            rays_drawn += 1
         passed += sums[lane]
     return out
 
 
 @wp.func
-def _count_in_lane(lit: VplSets, begin: int, lane: int, x: ShadingPoint, target: float) -> int:
-    """VPLs of a lane before its running sum passes a target."""
+def _count_in_lane(group: VplSets, begin: int, lane: int, x: ShadingPoint, target: float) -> int:
+    """Number of VPLs in a lane before its running sum passes a target."""
     running = float(0.0)
     k = int(0)
-    while k < lit.blocks:
-        running += _block_weights(lit, begin + k, x)[lane]
+    while k < group.blocks:
+        running += _block_weights(group, begin + k, x)[lane]
         if running > target:
             break
         k += 1
@@ -250,55 +278,57 @@ def _count_in_lane(lit: VplSets, begin: int, lane: int, x: ShadingPoint, target:
 
 @wp.func
 def _gather_one_by_one(
-    scene: SceneData, lit: VplSets, chosen: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
+    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
 ) -> wp.vec3:
-    """The same for a thread without lanes: one running sum, M targets along it.
+    """The scalar form, for CUDA: one running sum over the VPLs of a set, with M targets along it.
 
-    Rays are sent afterwards: what the sums need would have to be kept in registers meanwhile.
+    Rays are traced after the loop, since what the sums need would occupy registers during traversal.
     """
     out = wp.vec3(0.0)
-    begin = chosen * lit.blocks * _LANES
-    end = wp.min(begin + lit.blocks * _LANES, lit.count)
+    begin = set_index * group.blocks * _LANES
+    end = wp.min(begin + group.blocks * _LANES, group.count)
     total = float(0.0)
     for slot in range(begin, end):
-        total += _vpl_weight(scene, lit, x, slot)
+        total += _vpl_weight(scene, group, x, slot)
     if total <= 0.0:
         return out
-    share = total / float(rays)
+    per_ray = total / float(rays)
     running = float(0.0)
-    drawn = int(0)
-    slots = wp.zeros(shape=_MOST_RAYS, dtype=wp.int32)
+    rays_drawn = int(0)
+    slots = wp.zeros(shape=_MAX_RAYS, dtype=wp.int32)
     for slot in range(begin, end):
-        running += _vpl_weight(scene, lit, x, slot)
-        while drawn < rays and (float(drawn) + u) * share < running:
-            slots[drawn] = slot
-            drawn += 1
-    for k in range(drawn):
+        running += _vpl_weight(scene, group, x, slot)
+        while rays_drawn < rays and (float(rays_drawn) + u) * per_ray < running:
+            slots[rays_drawn] = slot
+            rays_drawn += 1
+    for k in range(rays_drawn):
         slot = slots[k]
-        position = lit.vpls.position[lit.order[slot]]
-        out += _shadowed_contribution(scene, lit, x, slot, position, color_of(lit, slot), share, max_bounce)
+        position = group.vpls.position[group.order[slot]]
+        out += _shadowed_contribution(
+            scene, group, x, slot, position, intensity_and_bounce(group, slot), per_ray, max_bounce
+        )
     return out
 
 
 @wp.func
-def _vpl_weight(scene: SceneData, lit: VplSets, x: ShadingPoint, slot: int) -> float:
-    vpl = lit.order[slot]
-    normal = lit.vpls.normal[vpl]
-    bound = bound_of(lit, vpl, normal)
-    weight = luminance(lit.vpls.intensity[vpl]) * bounded_geometry_term(x, lit.vpls.position[vpl], normal, bound)
-    if lit.shaped == 1 and weight > 0.0:
-        weight *= _vpl_shaping(scene, lit, vpl, x.position)
+def _vpl_weight(scene: SceneData, group: VplSets, x: ShadingPoint, slot: int) -> float:
+    vpl = group.order[slot]
+    normal = group.vpls.normal[vpl]
+    bound = bound_of(group, vpl, normal)
+    weight = mean_channel(group.vpls.intensity[vpl]) * bounded_geometry_term(x, group.vpls.position[vpl], normal, bound)
+    if group.shaped == 1 and weight > 0.0:
+        weight *= _vpl_shaping(scene, group, vpl, x.position)
     return weight
 
 
 @wp.func
-def _vpl_shaping(scene: SceneData, lit: VplSets, vpl: int, position: wp.vec3) -> float:
-    """The same for one VPL on a light."""
-    row = lit.vpls.modifiers[vpl]
+def _vpl_shaping(scene: SceneData, group: VplSets, vpl: int, position: wp.vec3) -> float:
+    """The approximate shaping factor of one VPL on a light, as seen from a position."""
+    row = group.vpls.modifiers[vpl]
     if row < 0:
         return 1.0
     modifiers = scene.light_tables[0].modifiers.rows[row]
-    target = lit.vpls.position[vpl]
+    target = group.vpls.position[vpl]
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
     cosine = -wp.dot(
         wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2]), wp.normalize(to_light)

@@ -1,4 +1,4 @@
-"""VPLs arranged for weighing: sorted along a space-filling curve, divided into sets, packed in blocks of sixteen.
+"""VPLs arranged for evaluation: divided into sets, sorted along a Z-order curve, packed in blocks of sixteen.
 
 Every set is a contiguous run of VPLs in the order of their paths. A run of a low-discrepancy sequence is itself well
 distributed, so every set alone is an unbiased estimate of the light (interleaved sampling, Keller and Heidrich 2001).
@@ -21,17 +21,18 @@ _LANES = wp.constant(LANES)
 BLOCK_ROWS = wp.constant(10)
 SHAPING_ROWS = wp.constant(7)
 _BLOCKS_PER_SET = wp.constant(16)
-"""A pixel weighs about 16 x 16 VPLs: a fraction of the cost of the shadow rays that follow."""
+"""A pixel evaluates about 16 x 16 VPLs, which costs a fraction of the shadow rays that follow."""
 _MAX_SETS = wp.constant(64)
 _PI = wp.constant(wp.float64(math.pi))
 UNBOUNDED = wp.constant(3.0e38)
 _LAST = wp.constant(2**31 - 1)
+"""Sort key of an empty row."""
 _AREAS = wp.constant(wp.float64(20.0))
-"""The bound takes hold within a disk of as many times the area that a VPL stands for. Small: noise from VPLs close
-by; large: noise from the rays that make up for the bound, and their cost. Flat around this value."""
+"""The bound takes effect within a disk of this many times the area that a VPL stands for. A smaller value leaves noise
+from VPLs close by; a larger one leaves noise, and costs time, from the compensation rays. The optimum is flat."""
 
 ON_LIGHTS, ON_SURFACES = wp.constant(0), wp.constant(1)
-"""The rows of what `build_sets` returns."""
+"""Rows of the array that `build_sets` returns."""
 
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -39,60 +40,60 @@ vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
 
 @wp.struct
 class VplSets:
-    """VPLs arranged for weighing: `sets` sets of `blocks` blocks of 16, the last padded with VPLs of no intensity.
+    """VPLs packed for vector lanes: `sets` sets of `blocks` blocks of 16, padded with VPLs of intensity 0.
 
-    Ten rows per block: x, y, z, w of the position, x, y, z, a of the normal, luminance, bound on G. If the VPLs lie on
-    lights and any is shaped, seven more in a table of their own: x, y, z of its axis, and slope, offset, least value
-    and end of the ramp by which its VPLs are weighed (`light_modifiers.approximate_shaping`).
+    A block has ten rows: x, y, z, w of the position, x, y, z, a of the normal, mean intensity, bound on G. If the VPLs
+    lie on lights and any light has shaping, a block has seven rows more in a table of their own: x, y, z of the axis,
+    and slope, offset, minimum and end of the ramp that approximates the shaping (`approximate_shaping`).
     """
 
-    sets: int  # this and what follows from the number of VPLs is known on the device alone
+    sets: int  # this, and whatever follows from the number of VPLs, is known on the device alone
     blocks: int  # per set
     count: int  # VPLs in all sets
-    bound: Bound
+    bound: Bound  # on G
     rows: wp.array[vec16]
-    shaped: int  # 1: there are rows of shaping
-    shapes: wp.array[vec16]
-    order: wp.array[wp.int32]  # their rows in `vpls`, set by set and in each along a space-filling curve
-    colors: wp.array[wp.vec4]  # intensity and bounce in that order: what is looked up at random lies close together
+    shaped: int  # 1: `shaping` has rows
+    shaping: wp.array[vec16]
+    order: wp.array[wp.int32]  # rows in `vpls`: set by set, and within a set along a Z-order curve through space
+    intensity_bounce: wp.array[wp.vec4]  # in that order: random lookups stay close together
     vpls: VplBuffer
 
 
 @wp.func
-def luminance(color: wp.vec3) -> float:
-    """Mean of the channels: all that matters here is that no channel is forgotten."""
-    return (color[0] + color[1] + color[2]) * (1.0 / 3.0)
+def mean_channel(intensity_bounce: wp.vec3) -> float:
+    """The mean of the channels. As a weight it need not be a luminance, but no channel may be left out."""
+    return (intensity_bounce[0] + intensity_bounce[1] + intensity_bounce[2]) * (1.0 / 3.0)
 
 
 @wp.func
-def bound_of(lit: VplSets, vpl: int, normal: wp.vec4) -> float:
-    """The bound on G for one VPL."""
+def bound_of(group: VplSets, vpl: int, normal: wp.vec4) -> float:
+    """The bound on G for one VPL: higher on lights whose VPLs lie dense; none where it shines everywhere alike."""
     if normal[3] == 1.0:
         return UNBOUNDED
-    if vpl < lit.vpls.on_lights:
-        return bound_for_pdf(lit.bound, lit.vpls.pdf_area[vpl])
-    return lit.bound.least
+    if vpl < group.vpls.on_lights:
+        return bound_for_pdf(group.bound, group.vpls.pdf_area[vpl])
+    return group.bound.least
 
 
 @wp.func
-def color_of(lit: VplSets, slot: int) -> wp.vec4:
-    """Intensity and bounce."""
-    vpl = lit.order[slot]
-    intensity = lit.vpls.intensity[vpl]
-    return wp.vec4(intensity[0], intensity[1], intensity[2], float(lit.vpls.bounce[vpl]))
+def intensity_and_bounce(group: VplSets, slot: int) -> wp.vec4:
+    """The intensity [W/sr] and, as the fourth component, the bounce of the VPL in a slot of the order."""
+    vpl = group.order[slot]
+    intensity = group.vpls.intensity[vpl]
+    return wp.vec4(intensity[0], intensity[1], intensity[2], float(group.vpls.bounce[vpl]))
 
 
 @wp.func
 def _spread_bits(x: int) -> int:
-    """Six bits, with two zeros between any two."""
+    """The lowest six bits of x, with two zeros after each: one coordinate of a Morton code."""
     y = (x | (x << 8)) & 0x0F00F
     y = (y | (y << 4)) & 0x0C30C3
     return (y | (y << 2)) & 0x249249
 
 
 @wp.func
-def _divided(count: int) -> wp.vec2i:
-    """Sets, as many as a pixel is spared, and the blocks of each."""
+def _divide_blocks(count: int) -> wp.vec2i:
+    """The number of sets (a power of two), and the number of blocks in each."""
     blocks = (count + _LANES - 1) // _LANES
     sets = int(1)
     while sets < _MAX_SETS and blocks >= 2 * sets * _BLOCKS_PER_SET:
@@ -101,8 +102,8 @@ def _divided(count: int) -> wp.vec2i:
 
 
 @wp.func
-def _with(lit: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
-    out = lit
+def _filled_in(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
+    out = group
     out.sets = divided[0]
     out.blocks = divided[1]
     out.count = count
@@ -112,7 +113,11 @@ def _with(lit: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
 
 @wp.func
 def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
-    """The bound where a pixel weighs so many VPLs, so many of them on lights; `build_sets` knows the rest."""
+    """The bound on G where a pixel evaluates `weighed` VPLs, `on_lights` of them on lights.
+
+    A VPL stands for area/weighed of the surfaces. Within a disk of `_AREAS` times that area, G can exceed the bound;
+    `density` says how much denser guided VPLs lie where they matter.
+    """
     out = Bound()
     out.least = UNBOUNDED
     if area > wp.float64(0.0):
@@ -122,7 +127,7 @@ def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) 
 
 
 @wp.kernel
-def _divide(
+def _divide_into_sets(
     first: int,
     lights: VplSets,
     surfaces: VplSets,
@@ -130,21 +135,21 @@ def _divide(
     density: wp.float64,
     area: wp.float64,
     keys: wp.array[wp.int32],
-    parts: wp.array[VplSets],
+    vpl_sets: wp.array[VplSets],
 ) -> None:
-    """Divides the VPLs into sets, and gives them keys to be sorted by.
+    """Divides the VPLs into sets, and writes their sort keys.
 
-    Lights come before surfaces, then counts the set, then the place on the Z-order curve; rows without a VPL come last.
+    The key's most significant part is light or surface, then the set, then the Morton code; empty rows come last.
     """
     i = first + wp.tid()
     vpls = lights.vpls
-    of_lights = _divided(vpls.on_lights)
-    of_surfaces = _divided(vpls.count[0] - vpls.on_lights)
+    of_lights = _divide_blocks(vpls.on_lights)
+    of_surfaces = _divide_blocks(vpls.count[0] - vpls.on_lights)
     if i == 0:
         weighed = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
         bound = _bound(weighed, _LANES * of_lights[1], density, area)
-        parts[0] = _with(lights, of_lights, vpls.on_lights, bound)
-        parts[1] = _with(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
+        vpl_sets[0] = _filled_in(lights, of_lights, vpls.on_lights, bound)
+        vpl_sets[1] = _filled_in(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
     lights.order[i] = i
     keys[i] = _LAST
     if i < vpls.count[0]:
@@ -160,91 +165,90 @@ def _divide(
 
 
 @wp.kernel
-def _pack(first: int, parts: wp.array[VplSets]) -> None:
-    """Writes block `i`, those of the lights first: every lane runs along a part of the set's curve of its own."""
+def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs block `i`; blocks of lights come first. Every lane follows its own section of the set's Z-order curve."""
     i = first + wp.tid()
-    part = int(ON_LIGHTS)
-    if i >= parts[part].sets * parts[part].blocks:
-        i -= parts[part].sets * parts[part].blocks
-        part = int(ON_SURFACES)
-    lit = parts[part]
-    if i >= lit.sets * lit.blocks:
+    kind = int(ON_LIGHTS)
+    if i >= vpl_sets[kind].sets * vpl_sets[kind].blocks:
+        i -= vpl_sets[kind].sets * vpl_sets[kind].blocks
+        kind = int(ON_SURFACES)
+    group = vpl_sets[kind]
+    if i >= group.sets * group.blocks:
         return
-    begin = (i // lit.blocks) * lit.blocks * _LANES
+    begin = (i // group.blocks) * group.blocks * _LANES
     for lane in range(_LANES):
-        slot = begin + lit.blocks * lane + i % lit.blocks
+        slot = begin + group.blocks * lane + i % group.blocks
         position = wp.vec4(0.0)
         normal = wp.vec4(0.0)
         strength = float(0.0)
         bound = float(UNBOUNDED)
-        if slot < lit.count:
-            vpl = lit.order[slot]
-            position = lit.vpls.position[vpl]
-            normal = lit.vpls.normal[vpl]
-            strength = luminance(lit.vpls.intensity[vpl])
-            bound = bound_of(lit, vpl, normal)
-            lit.colors[slot] = color_of(lit, slot)
+        if slot < group.count:
+            vpl = group.order[slot]
+            position = group.vpls.position[vpl]
+            normal = group.vpls.normal[vpl]
+            strength = mean_channel(group.vpls.intensity[vpl])
+            bound = bound_of(group, vpl, normal)
+            group.intensity_bounce[slot] = intensity_and_bounce(group, slot)
         for k in range(4):
-            lit.rows[BLOCK_ROWS * i + k][lane] = position[k]
-            lit.rows[BLOCK_ROWS * i + 4 + k][lane] = normal[k]
-        lit.rows[BLOCK_ROWS * i + 8][lane] = strength
-        lit.rows[BLOCK_ROWS * i + 9][lane] = bound
+            group.rows[BLOCK_ROWS * i + k][lane] = position[k]
+            group.rows[BLOCK_ROWS * i + 4 + k][lane] = normal[k]
+        group.rows[BLOCK_ROWS * i + 8][lane] = strength
+        group.rows[BLOCK_ROWS * i + 9][lane] = bound
 
 
 @wp.kernel
-def _pack_shaping(first: int, scene: SceneData, parts: wp.array[VplSets]) -> None:
-    """Writes the rows of shaping of block `i`."""
+def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs the rows of shaping of block `i`."""
     i = first + wp.tid()
-    lit = parts[ON_LIGHTS]
-    if i >= lit.sets * lit.blocks:
+    group = vpl_sets[ON_LIGHTS]
+    if i >= group.sets * group.blocks:
         return
-    begin = (i // lit.blocks) * lit.blocks * _LANES
+    begin = (i // group.blocks) * group.blocks * _LANES
     for lane in range(_LANES):
-        slot = begin + lit.blocks * lane + i % lit.blocks
+        slot = begin + group.blocks * lane + i % group.blocks
         axis = wp.vec3(0.0)
         ramp = wp.vec4(0.0, 1.0, 1.0, -2.0)  # level: not shaped
-        if slot < lit.count:
-            row = lit.vpls.modifiers[lit.order[slot]]
+        if slot < group.count:
+            row = group.vpls.modifiers[group.order[slot]]
             if row >= 0:
                 modifiers = scene.light_tables[0].modifiers.rows[row]
                 axis = wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2])
                 ramp = wp.vec4(modifiers.slope, modifiers.offset, modifiers.least, modifiers.cutoff)
         for k in range(3):
-            lit.shapes[SHAPING_ROWS * i + k][lane] = axis[k]
+            group.shaping[SHAPING_ROWS * i + k][lane] = axis[k]
         for k in range(4):
-            lit.shapes[SHAPING_ROWS * i + 3 + k][lane] = ramp[k]
+            group.shaping[SHAPING_ROWS * i + 3 + k][lane] = ramp[k]
 
 
 def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplSets]:
-    """The `VplSets` of the VPLs on lights and of those on surfaces: two rows.
+    """Arranges VPLs: one `VplSets` of those on lights, one of those on surfaces (`ON_LIGHTS`, `ON_SURFACES`).
 
-    The area of the scene's surfaces, the number of VPLs that a pixel weighs and how densely the guide puts them give
-    the bound on G. All that depends on the number of VPLs is left to the device; here there is room for as many as
-    there may be, and what is launched beyond ends at once.
+    The host does not know the number of VPLs. It allocates and launches for the capacity, and threads without a VPL end
+    at once.
     """
     scene, launcher = guide.scene, scratch.launcher
-    packed = not launcher.device.is_cuda  # a thread without lanes weighs the VPLs as they are
-    # The sort wants room for a second copy.
+    packed = not launcher.device.is_cuda  # on CUDA a thread evaluates VPLs one by one, from the buffer
+    # The radix sort needs twice the memory of its data.
     keys = scratch.array("gather.keys", max(2 * vpls.capacity, 1), wp.int32)
     order = scratch.array("gather.order", max(2 * vpls.capacity, 1), wp.int32)
-    parts = scratch.array("gather.parts", 2, VplSets)
+    vpl_sets = scratch.array("gather.parts", 2, VplSets)
     lights, surfaces = VplSets(), VplSets()
     blocks = []
-    for lit, name, begin, end in (
+    for group, name, begin, end in (
         (lights, "lights", 0, vpls.on_lights),
         (surfaces, "surfaces", vpls.on_lights, vpls.capacity),
     ):
         most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
         blocks.append(most)
-        lit.vpls, lit.order = vpls, order[begin:] if end > begin else order
-        lit.rows = scratch.array(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
-        lit.colors = scratch.array(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
-        lit.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        lit.shapes = scratch.array(f"gather.{name}.shapes", max(SHAPING_ROWS * most * lit.shaped, 1), vec16)
-    inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, parts]
-    launcher.launch(_divide, max(vpls.capacity, 1), inputs)  # where nothing emits, that has to be said, too
+        group.vpls, group.order = vpls, order[begin:] if end > begin else order
+        group.rows = scratch.array(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
+        group.intensity_bounce = scratch.array(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
+        group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
+        group.shaping = scratch.array(f"gather.{name}.shapes", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
+    inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, vpl_sets]
+    launcher.launch(_divide_into_sets, max(vpls.capacity, 1), inputs)  # also without VPLs: counts must become 0
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
-    launcher.launch(_pack, sum(blocks), [parts])
+    launcher.launch(_pack, sum(blocks), [vpl_sets])
     if lights.shaped:
-        launcher.launch(_pack_shaping, blocks[0], [scene.data, parts])
-    return parts
+        launcher.launch(_pack_shaping, blocks[0], [scene.data, vpl_sets])
+    return vpl_sets
