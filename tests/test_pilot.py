@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-import warp_ir.estimators.vpl
 from tests.physics.closed_form import assert_mean
 from warp_ir import procedural
-from warp_ir.guiding.emitter_selection import BY_POWER, probabilities
-from warp_ir.guiding.importance import means
+from warp_ir.guiding.emitter_selection import POWER_FRACTION, probabilities
+from warp_ir.guiding.importance import importance_by_cell
 from warp_ir.guiding.photon_target import nearest_point
 from warp_ir.guiding.probes import trace_camera_probes
 from warp_ir.metrics import z_scores
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind
-from warp_ir.vpl.guide import CELLS, SIDES, unguided
+from warp_ir.settings import GuidingSettings
+from warp_ir.vpl.guide import CELLS, SIDES
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
@@ -33,21 +33,19 @@ def wide(monkeypatch):
     return wide_scenes
 
 
-@pytest.fixture(autouse=True)
-def from_the_first_iteration(monkeypatch):
-    """Guides all iterations."""
-    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 0)
+ALWAYS = GuidingSettings(first_iteration=0)
+"""Guides all iterations."""
 
 
-def film_of(scene, *, threads=None, device="cpu", **settings):
+def film_of(scene, *, threads=None, device="cpu", guiding=ALWAYS, **settings):
     settings = ir.RenderSettings(**{"width": 24, "height": 24, "filter": False, "light_paths": 64, **settings})
-    return Renderer(scene, settings, device=device, threads=threads).render()
+    return Renderer(scene, settings, device=device, threads=threads, guiding=guiding).render()
 
 
-def iterations_of(scene, width, iterations, device, light_paths=64):
+def iterations_of(scene, width, iterations, device, light_paths=64, guiding=ALWAYS):
     """A renderer, its film, and the mean radiance of every iteration."""
     settings = ir.RenderSettings(width=width, height=width, filter=False, light_paths=light_paths)
-    renderer = Renderer(scene, settings, device=device)
+    renderer = Renderer(scene, settings, device=device, guiding=guiding)
     film, averages = renderer.new_film(), []
     for k in range(iterations):
         one = renderer.new_film()
@@ -57,16 +55,10 @@ def iterations_of(scene, width, iterations, device, light_paths=64):
     return renderer, film, np.array(averages)
 
 
-def variances(scene, device):
-    """Of an iteration: relative, of its pixels and of their mean."""
-    _, film, averages = iterations_of(scene, 64, 32, device, 512)
+def variances(scene, device, guiding):
+    """The relative variance of an iteration's pixels, and of their mean."""
+    _, film, averages = iterations_of(scene, 64, 32, device, 512, guiding)
     return film.error() ** 2, averages.var(ddof=1) / averages.mean() ** 2
-
-
-def without_pilot(monkeypatch):
-    monkeypatch.setattr(
-        warp_ir.estimators.vpl, "learn", lambda scene, camera, launcher, settings: unguided(scene, launcher)
-    )
 
 
 @pytest.mark.parametrize(
@@ -95,35 +87,31 @@ def test_light_is_the_same(wide, name, guided, device):
 
 
 @pytest.mark.parametrize("name, gains", [("rooms", (1.3, 1.5)), ("house", (1.3, 1.5))])
-def test_noise_is_less(wide, monkeypatch, name, gains, device):
+def test_noise_is_less(wide, name, gains, device):
     """In one of a hundred rooms, and where the sun comes in by a window: variance of pixels, and of their mean.
 
     The latter is 2.3 and 3 times less over eight seeds; of 32 iterations it is known to a third.
     """
     scene = getattr(wide, name)()
-    guided = variances(scene, device)
-    without_pilot(monkeypatch)
-    assert all(g * gain < u for g, u, gain in zip(guided, variances(scene, device), gains, strict=True))
+    guided, plain = (variances(scene, device, guiding) for guiding in (ALWAYS, None))
+    assert all(g * gain < u for g, u, gain in zip(guided, plain, gains, strict=True))
 
 
-def test_nothing_changes_where_little_is_gained(monkeypatch, device):
-    """In the Cornell box the camera feels all light: the same bits as without a pilot, and of one lamp none is sent."""
+def test_nothing_changes_where_little_is_gained(device):
+    """In the Cornell box all light matters to the camera: learning changes no bit, and for one lamp nothing is learned."""
     how = {"iterations": 2, "width": 64, "height": 64}
     alone = film_of(cornell_box(), device=device, **how)
     assert not any(name in alone.counts for name in GUIDED)
-    monkeypatch.setattr("warp_ir.guiding.learn._APART", 0.0)
-    guided = film_of(cornell_box(), device=device, **how)
+    guided = film_of(cornell_box(), device=device, guiding=replace(ALWAYS, min_separation=0.0), **how)
     assert [guided.counts[name] for name in GUIDED] == [0, 0, 0]
     assert np.array_equal(guided.radiance(), alone.radiance())
 
 
-def test_short_pictures_have_no_pilot(wide, monkeypatch):
+def test_short_pictures_are_not_guided(wide):
     """The first iterations are those without a guide; the ones after them are guided."""
-    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 2)
-    short, long = (film_of(wide.rooms(), iterations=n) for n in (2, 3))
+    short, long = (film_of(wide.rooms(), iterations=n, guiding=GuidingSettings(first_iteration=2)) for n in (2, 3))
     assert "guided_vpls" not in short.counts and long.counts["guided_vpls"] == 1
-    without_pilot(monkeypatch)
-    plain = [film_of(wide.rooms(), iterations=n).radiance() for n in (2, 3)]
+    plain = [film_of(wide.rooms(), iterations=n, guiding=None).radiance() for n in (2, 3)]
     assert np.array_equal(short.radiance(), plain[0]) and not np.array_equal(long.radiance(), plain[1])
 
 
@@ -173,9 +161,9 @@ def test_probabilities_of_emitters():
     assert np.allclose(unknown, power, rtol=1e-12)
     emitter = np.repeat([1, 4], 10**6)
     known = probabilities(power, emitter, np.repeat([3.0, 1.0], 10**6))
-    expected = BY_POWER * power + (1.0 - BY_POWER) * np.array([0.0, 0.75, 0.0, 0.0, 0.25])
+    expected = POWER_FRACTION * power + (1.0 - POWER_FRACTION) * np.array([0.0, 0.75, 0.0, 0.0, 0.25])
     assert np.allclose(known, expected, atol=1e-4)
-    assert np.isclose(known.sum(), 1.0, rtol=1e-12) and (known >= BY_POWER * power).all()
+    assert np.isclose(known.sum(), 1.0, rtol=1e-12) and (known >= POWER_FRACTION * power).all()
 
 
 def test_where_lines_meet():
@@ -194,13 +182,13 @@ def test_where_lines_meet():
 def test_worth_of_cells():
     """Many VPLs tell the mean of their cell; where there are none, it is that of the cells around."""
     cell = np.repeat([0, 1], 10**5)
-    table = means(cell, np.ones(2 * 10**5), np.repeat([2.0, 4.0], 10**5))
+    table = importance_by_cell(cell, np.ones(2 * 10**5), np.repeat([2.0, 4.0], 10**5))
     assert table.shape == (SIDES * CELLS**3,)
     assert np.allclose(table[:2], [2.0, 4.0], rtol=1e-3)
     assert np.isclose(table[CELLS], 3.0, rtol=1e-3) and np.isclose(table[-1], 3.0, rtol=1e-3)
 
 
-def test_both_halves_of_the_pilot_see_the_picture():
+def test_both_halves_of_the_probes_see_the_picture():
     """What is learned from one half of the camera paths is measured by the other: both are spread over the image."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=64, height=64, filter=False))
     camera = renderer._shutter[0].camera

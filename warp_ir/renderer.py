@@ -32,13 +32,23 @@ from warp_ir.reconstruction import BLUR_MODULES, FILTER_MODULES, SCRATCH, Recons
 from warp_ir.sampling.sobol import stratum
 from warp_ir.scene import InputError, Scene
 from warp_ir.scheduling import AdaptiveScheduler, Progress
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import GuidingSettings, RenderSettings
+
+_GUIDING = GuidingSettings()
 
 
 class Renderer:
     """A scene on a device, ready to add iterations to films."""
 
-    def __init__(self, scene: Scene, settings: RenderSettings, *, device: str = "cpu", threads: int | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        settings: RenderSettings,
+        *,
+        device: str = "cpu",
+        threads: int | None = None,
+        guiding: GuidingSettings | None = _GUIDING,
+    ):
         """Uploads the scene and compiles the kernels that its estimator needs.
 
         Args:
@@ -46,6 +56,7 @@ class Renderer:
             settings: How to render it.
             device: "cpu", "cuda" or "cuda:N".
             threads: CPU threads; by default one per core. The picture does not depend on it.
+            guiding: When light paths are guided; None: never.
 
         Raises:
             InputError: The scene, the settings or the device cannot be used.
@@ -56,6 +67,7 @@ class Renderer:
             denoise_seconds(1)  # starts the denoiser before the work: it may be missing, and starting takes a while
         self.launcher = Launcher(device, threads)
         self._scratch = Scratch(self.launcher)
+        self._guiding = guiding
         self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._shutter: list[_ShutterState] = []
         self._layout: _BufferLayout | None = None
@@ -149,7 +161,7 @@ class Renderer:
 
     def _take_settings(self, scene: Scene) -> None:
         """Fills in the settings that depend on the scene's camera, and refuses pictures too large for the memory."""
-        self._resolved = self.wanted.resolve(scene.camera.aspect)
+        self._resolved = self.wanted.resolve(scene.camera.aspect, self._guiding)
         self.settings = replace(self.wanted, height=self._resolved.height)
         _, _, columns, rows = self.settings.pixels()
         needed, available = columns * rows * pixel_bytes(scene, self._resolved), self.launcher.memory()

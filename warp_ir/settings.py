@@ -118,11 +118,12 @@ class RenderSettings:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
 
-    def resolve(self, aspect: float = 1.0) -> "ResolvedSettings":
+    def resolve(self, aspect: float = 1.0, guiding: "GuidingSettings | None" = None) -> "ResolvedSettings":
         """These settings with every default filled in.
 
         Args:
-            aspect: The camera's, width over height: it gives the height where none is set.
+            aspect: Width over height of the camera's window: it gives the height where none is set.
+            guiding: When light paths are guided; None: never.
 
         Raises:
             InputError: The picture has too many pixels.
@@ -138,6 +139,7 @@ class RenderSettings:
             "max_bounces": UNLIMITED if self.max_bounces is None else self.max_bounces,
             "absorption": self.absorption or ("fractional" if keller else "roulette"),
             "filter": self.filter and self.estimator == "vpl",
+            "guiding": guiding,
         }
         return ResolvedSettings(**values)
 
@@ -167,6 +169,19 @@ def _positive(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < math.inf
 
 
+@dataclass(frozen=True)
+class GuidingSettings:
+    """When light paths are guided (`vpl` only). The mean of the picture does not depend on it; noise and time do."""
+
+    first_iteration: int = 4
+    """Iterations before this one are not guided: learning would take too large a part of a shorter render."""
+    min_separation: float = 0.25
+    """Least distance between emitters, relative to the scene's diagonal, at which guiding is tried.
+
+    Lights that are closer together are usually seen together, or not at all. Lights at infinity always count.
+    """
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResolvedSettings(RenderSettings):
     """Settings in which no default is left to be filled in: what `RenderSettings.resolve` returns."""
@@ -176,3 +191,5 @@ class ResolvedSettings(RenderSettings):
     max_bounces: int
     """`UNLIMITED` where there is no limit."""
     absorption: str
+    guiding: GuidingSettings | None
+    """None: light paths are never guided."""

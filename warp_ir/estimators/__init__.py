@@ -1,8 +1,8 @@
 """The estimators: ways to compute the light of one iteration, one file each.
 
-An estimator is built as ``Estimator(scene, camera, settings, scratch)``. Then ``estimate(iteration, gbuffer)`` fills the
-G-buffer of one iteration: what the camera sees, and the direct and indirect irradiance over π there. The result depends
-on these arguments alone.
+An estimator is built as ``Estimator(scene, camera, settings, scratch)``. Then ``estimate(iteration, gbuffer)`` fills
+the G-buffer of one iteration: what the camera sees, and the direct and indirect irradiance over π there. The result
+depends on these arguments alone.
 """
 
 from collections.abc import Sequence

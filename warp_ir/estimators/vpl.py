@@ -6,12 +6,13 @@ cosine-distributed ray per point compensates for that (Kollig and Keller 2004):
     E(x) = Σ I min(G, b) V + ∫ L(y) (1 - b/G)⁺ cosθ dω,        y what the ray hits
 
 Since G ≤ 1/d², G cannot exceed b beyond the distance 1/√b: the ray is no longer than that, and usually hits nothing.
-The point it hits gathers in turn, and so on. Emission that the ray meets counts with the clamped fraction (1 - b/G)⁺, which
-is exactly what the bound took from the VPLs on that emitter: nothing counts twice.
+The point it hits gathers in turn, and so on. Emission that the ray meets counts with the clamped fraction (1 - b/G)⁺,
+which is exactly what the bound took from the VPLs on that emitter: nothing counts twice.
 
 The bound follows from the density of the VPLs (`vpl.sets`): no length in scene units is chosen anywhere.
 """
 
+import math
 from collections.abc import Sequence
 from types import ModuleType
 from typing import ClassVar
@@ -44,8 +45,6 @@ _SHADOW_RAYS = (4, 4)
 """Shadow rays per pixel and iteration, to VPLs on lights and to VPLs on surfaces."""
 _COMPENSATION_SHADOW_RAYS = (2, 2)
 """Shadow rays at the end of a compensation ray, whose light has lost most of its weight."""
-_UNGUIDED_ITERATIONS = 4
-"""Number of first iterations without guiding: learning would take too large a part of a shorter render."""
 _ROULETTE_DEPTH = wp.constant(2)
 _GATHER_STREAM = 0x5BD1E995  # decorrelates gathering from the light paths
 
@@ -175,11 +174,14 @@ class VplEstimator:
         self._scene, self._camera, self._settings = scene, camera, settings
         self._scratch, self._launcher = scratch, scratch.launcher
         self._unguided = unguided(scene, scratch.launcher)
-        self._guide: Guide | None = self._unguided
-        if guiding_applies(scene):
-            self._guide = None  # learned later
-            if settings.iteration_limit > _UNGUIDED_ITERATIONS:
-                scratch.launcher.load([warp_ir.guiding.probes])
+        self._guide: Guide | None = None
+        """The guide, once it has been learned."""
+        guiding = settings.guiding
+        self._first_guided = math.inf
+        if guiding is not None and guiding_applies(scene, guiding.min_separation):
+            self._first_guided = guiding.first_iteration
+        if settings.iteration_limit > self._first_guided:
+            scratch.launcher.load([warp_ir.guiding.probes])
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
@@ -214,7 +216,7 @@ class VplEstimator:
 
     def _guide_of(self, iteration: int) -> Guide:
         """The guide of an iteration's light paths; it is learned when it is first needed."""
-        if iteration < _UNGUIDED_ITERATIONS:
+        if iteration < self._first_guided:
             return self._unguided
         if self._guide is None:
             with self._launcher.phase("guiding"):

@@ -1,4 +1,4 @@
-"""How often each emitter is chosen, by what it gives to the picture."""
+"""Probabilities of selecting each emitter, learned from its contribution to the picture."""
 
 from dataclasses import replace
 
@@ -12,37 +12,37 @@ from warp_ir.guiding.probes import CameraProbes
 
 Floats = npt.NDArray[np.float64]
 
-BY_POWER = 0.25
-"""Share of the paths that begin as if nothing was known: no weight is more than four times as large."""
+POWER_FRACTION = 0.25
+"""Share of the light paths that start in proportion to power: no weight grows by more than a factor of four."""
 PRIOR = 4.0
-"""Samples that what was known before stands for, beside those of the pilot."""
-WORTH = 1.15
-"""Times the variance without, at which learning is worth while."""
+"""Number of samples that the prior, selection by power, counts for beside the probes."""
+MIN_GAIN = 1.15
+"""Least ratio of the variance without guiding to that with it, below which nothing is changed."""
 
 
-def learn_emitter_probabilities(scene: DeviceScene, seen: CameraProbes, launcher: Launcher) -> DeviceScene | None:
-    """The scene, whose emitters are chosen by what they give; None if that gains little."""
+def learn_emitter_probabilities(scene: DeviceScene, probes: CameraProbes, launcher: Launcher) -> DeviceScene | None:
+    """The scene with learned selection probabilities of its emitters; None if the gain is below `MIN_GAIN`."""
     if scene.data.emitter_count < 2:
         return None
     power = np.diff(scene.data.emitter_cdf.numpy().astype(np.float64))
-    power = np.maximum(power, np.finfo(np.float32).tiny)  # too weak for a float, and never chosen
-    learned = probabilities(power, seen.emitter[seen.even], seen.score[seen.even])
-    emitter, squares = seen.emitter[~seen.even], seen.score[~seen.even] ** 2
-    if squares.sum() <= WORTH * (squares * (power / learned)[emitter]).sum():
+    power = np.maximum(power, np.finfo(np.float32).tiny)  # a probability too small for float32
+    learned = probabilities(power, probes.emitter[probes.even], probes.score[probes.even])
+    emitter, squares = probes.emitter[~probes.even], probes.score[~probes.even] ** 2
+    if squares.sum() <= MIN_GAIN * (squares * (power / learned)[emitter]).sum():
         return None
-    return _rechosen(scene, power, probabilities(power, seen.emitter, seen.score), launcher)
+    return _with_probabilities(scene, power, probabilities(power, probes.emitter, probes.score), launcher)
 
 
 def probabilities(power: Floats, emitter: npt.NDArray[np.int64], score: Floats) -> Floats:
-    """Probabilities of choosing each emitter, float64 [emitters].
+    """Probabilities of selecting each emitter, float64 [emitters].
 
-    Down a binary tree over the list, in which neighbours are close to each other: either half gets what its samples
-    say where they are many, and what its power says where they are few.
+    They are split down a binary tree over the list of emitters, in which neighbours are close to each other. At a node
+    with many samples, the children get the shares of their samples; with few samples, the shares of their power.
 
     Args:
-        power: By which they were chosen, float64 [emitters], positive.
-        emitter: Of each sample.
-        score: What came from it, over the probability of the choice.
+        power: Selection probabilities of the samples, float64 [emitters], positive.
+        emitter: Emitter of each sample.
+        score: Contribution of each sample over its selection probability.
     """
     size = 1 << (len(power) - 1).bit_length()
     samples = [np.bincount(emitter, score**k, size).astype(np.float64) for k in (1, 2)]
@@ -50,26 +50,26 @@ def probabilities(power: Floats, emitter: npt.NDArray[np.int64], score: Floats) 
     while len(tree[-1][0]) > 1:
         tree.append([x[0::2] + x[1::2] for x in tree[-1]])
     out = np.ones(1)
-    for halves, (power_of_both, sum_of_both, squares) in zip(tree[-2::-1], tree[:0:-1], strict=True):
-        samples_that_count = _ratio(sum_of_both**2, squares)
-        trust = samples_that_count / (samples_that_count + PRIOR)
-        left = trust * _ratio(halves[1][0::2], sum_of_both) + (1.0 - trust) * _ratio(halves[0][0::2], power_of_both)
+    for children, (parent_power, parent_sum, squares) in zip(tree[-2::-1], tree[:0:-1], strict=True):
+        effective_samples = _ratio(parent_sum**2, squares)
+        trust = effective_samples / (effective_samples + PRIOR)
+        left = trust * _ratio(children[1][0::2], parent_sum) + (1.0 - trust) * _ratio(children[0][0::2], parent_power)
         out = np.stack([out * left, out * (1.0 - left)], axis=1).reshape(-1)
-    return np.asarray(BY_POWER * power + (1.0 - BY_POWER) * out[: len(power)])
+    return np.asarray(POWER_FRACTION * power + (1.0 - POWER_FRACTION) * out[: len(power)])
 
 
 def _ratio(a: Floats, b: Floats) -> Floats:
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0.0)
 
 
-def _rechosen(scene: DeviceScene, power: Floats, chosen: Floats, launcher: Launcher) -> DeviceScene:
-    """The same scene, its emitters chosen with other probabilities."""
+def _with_probabilities(scene: DeviceScene, power: Floats, probability: Floats, launcher: Launcher) -> DeviceScene:
+    """The scene with other selection probabilities of its emitters."""
     data = copy_record(scene.data)
-    cdf = np.concatenate([[0.0], np.cumsum(chosen)])
+    cdf = np.concatenate([[0.0], np.cumsum(probability)])
     cdf /= cdf[-1]
     data.emitter_cdf = launcher.array(cdf, wp.float32)
     data.emitter_pdf_area = launcher.array(scene.data.emitter_pdf_area.numpy() * (np.diff(cdf) / power), wp.float32)
-    itself = launcher.empty(1, SceneData)
-    data.address = wp.uint64(itself.ptr)
-    itself.assign(launcher.array([data], SceneData))
-    return replace(scene, data=data, keep=(*scene.keep, itself))
+    device_copy = launcher.empty(1, SceneData)
+    data.address = wp.uint64(device_copy.ptr)
+    device_copy.assign(launcher.array([data], SceneData))
+    return replace(scene, data=data, keep=(*scene.keep, device_copy))

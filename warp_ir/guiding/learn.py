@@ -1,25 +1,25 @@
-"""The pilot: a small look at the scene that learns where light paths should go, once for every camera.
+"""Path guiding for light paths: what a few probe paths tell about where light paths matter to the picture.
 
-Light paths begin on emitters in proportion to power. Of a hundred lit rooms the camera may see one: then so do a
-hundredth of the VPLs. Some hundred camera paths ask at each of their vertices for the light of random emitters, shadows
-and all, and some hundred light paths leave VPLs that are connected with what the camera sees. That tells
+Light paths start on emitters in proportion to power. If the camera sees one of a hundred lit rooms, only one in a
+hundred VPLs lights the picture. So one or two thousand camera paths sample random emitters at each of their vertices,
+with shadows, and half as many light paths leave VPLs that are connected with points that the camera sees. From these
+samples are learned
 
-* how much of the picture is due to each emitter              emitters.py
-* close by which point the light from far away passes          rings.py
-* what VPLs give to the picture, by where they are             worth.py
+* the probability of selecting each emitter                            emitter_selection.py
+* the point close to which the light of suns and skies passes          photon_target.py
+* the survival probability of VPLs, by their contribution              importance.py
 
-Half of the samples learn, the other half measures what would be gained; where that is little, nothing changes. All
-of it is a pure function of the scene, the camera, the size of the image and the seed: whoever renders
-some iterations of a picture, or a part of it, learns the same.
+Half of the samples are learned from; the other half measures the gain, and where that is small, nothing changes. The
+result is a pure function of the scene, the camera, the size of the image and the seed: whoever renders some iterations
+of a picture, or a part of it, learns the same.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene import DeviceScene
+from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.guiding.emitter_selection import learn_emitter_probabilities
 from warp_ir.guiding.importance import learn_survival
 from warp_ir.guiding.photon_target import learn_photon_target
@@ -28,68 +28,72 @@ from warp_ir.scene import LightKind
 from warp_ir.settings import ResolvedSettings
 from warp_ir.vpl.guide import Guide, unguided
 
-_APART = 0.25
-"""Of the scene's diagonal: lights that are closer together than that are seen together, or not at all."""
-_FEWEST, _MOST = 1024, 2048
-"""Camera paths; one for every sixteen pixels within these limits, so that they take a small part of an iteration."""
+_MIN_CAMERA_PATHS, _MAX_CAMERA_PATHS = 1024, 2048
+"""Limits of the number of camera paths, one for every sixteen pixels: they take a small part of an iteration."""
 _VPLS_PER_PATH = 1.5
-"""On surfaces, and kept, as in a room. Where light escapes, or VPLs are dropped, more paths make up for it."""
-_MOST_PATHS = 16
+"""Surviving VPLs on surfaces per light path, as in a closed room. Where there are fewer, more paths are started."""
+_MAX_PATHS = 16
+"""Largest factor by which the number of light paths grows."""
 _PIXELS_PER_PATH = 2
-"""Of the image at least, for every light path that is started: so the paths remain cheap next to the gathering."""
+"""Least number of pixels per light path: so tracing the paths remains cheap beside gathering."""
 
 
-def guiding_applies(scene: DeviceScene) -> bool:
-    """Whether there is anything to learn: light from far away, or from places far apart."""
+def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
+    """Whether there is anything to learn: lights at infinity, or emitters far apart.
+
+    Args:
+        scene: The scene.
+        min_separation: `GuidingSettings.min_separation`.
+    """
     lights, materials = scene.stored.lights, scene.stored.materials
     if any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in lights):
         return True
-    places = [light.world_from_light[:3, 3] for light in lights]
+    positions = [light.world_from_light[:3, 3] for light in lights]
     emits = np.array([max(material.emission) > 0.0 for material in materials], bool)
     for mesh in scene.stored.meshes if emits.any() else ():
-        glowing = mesh.triangles[emits[mesh.material]]
-        if len(glowing):
-            points = mesh.points[glowing.reshape(-1)]
-            places += [points.min(axis=0), points.max(axis=0)]
+        emissive = mesh.triangles[emits[mesh.material]]
+        if len(emissive):
+            points = mesh.points[emissive.reshape(-1)]
+            positions += [points.min(axis=0), points.max(axis=0)]
     lower, upper = np.reshape(scene.bounds, (2, 3))
-    return len(places) > 1 and bool(np.linalg.norm(np.ptp(places, axis=0)) > _APART * np.linalg.norm(upper - lower))
+    return len(positions) > 1 and bool(
+        np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * np.linalg.norm(upper - lower)
+    )
 
 
-def learn(scene: DeviceScene, camera: Any, launcher: Launcher, settings: ResolvedSettings) -> Guide:
-    """Sends the pilot, and returns where light paths should go.
+def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: ResolvedSettings) -> Guide:
+    """Traces probe paths, and returns the guide of a view.
 
-    What it has decided is in the launcher's counts: `guided_emitters`, `guided_far_lights`, `guided_vpls` are 1 or 0.
+    The launcher's counts `guided_emitters`, `guided_far_lights` and `guided_vpls` say what was changed: 1 or 0.
 
     Args:
-        scene: Where.
-        camera: The `CameraData` of what is to be rendered; of it the whole image counts, whatever part is rendered.
-        launcher: Where to run.
-        settings: With a definite width and height.
+        scene: The scene.
+        camera: The camera; its whole image counts, whatever part of it is rendered.
+        launcher: Runs the kernels.
+        settings: The settings of the render.
     """
     guide = unguided(scene, launcher)
     pixels = camera.image_columns * camera.image_rows
-    paths = min(max(pixels // 16, _FEWEST), _MOST)
-    # VPLs are dropped only where more paths can make up for them: else there would be less noise, but in larger spots.
-    most = min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MOST_PATHS)
-    chosen = photon_target = importance = None
-    left = _VPLS_PER_PATH
+    paths = min(max(pixels // 16, _MIN_CAMERA_PATHS), _MAX_CAMERA_PATHS)
+    # VPLs are dropped only where more paths make up for them; else the noise would be lower, but of lower frequency.
+    max_paths = min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MAX_PATHS)
+    guided_scene = photon_target = survival = None
+    vpls_per_path = _VPLS_PER_PATH
     if scene.emits:
-        sightings = trace_camera_probes(scene, camera, launcher, paths, settings)
-        if sightings.score.any():
-            chosen, photon_target = (
-                learn_emitter_probabilities(scene, sightings, launcher),
-                learn_photon_target(scene, sightings, launcher),
-            )
-            guide = replace(guide, scene=chosen or scene, photon_target=photon_target or guide.photon_target)
-            if most > 1:
-                found = connect_vpls(guide, launcher, sightings, paths // 2, settings)
-                importance, left = learn_survival(found, guide, launcher), found.per_path
-    if importance is not None:
-        left *= importance.kept
-        guide = replace(guide, importance=importance.table, density=importance.density)
-    if left > 0.0:
-        guide = replace(guide, paths=max(min(round(_VPLS_PER_PATH / left), most), 1))
-    decided = {"guided_emitters": chosen, "guided_far_lights": photon_target, "guided_vpls": importance}
-    for name, learned in decided.items():
-        launcher.profile.counts[name] = int(learned is not None)
+        probes = trace_camera_probes(scene, camera, launcher, paths, settings)
+        if probes.score.any():
+            guided_scene = learn_emitter_probabilities(scene, probes, launcher)
+            photon_target = learn_photon_target(scene, probes, launcher)
+            guide = replace(guide, scene=guided_scene or scene, photon_target=photon_target or guide.photon_target)
+            if max_paths > 1:
+                connections = connect_vpls(guide, launcher, probes, paths // 2, settings)
+                survival, vpls_per_path = learn_survival(connections, guide, launcher), connections.per_path
+    if survival is not None:
+        vpls_per_path *= survival.survival_rate
+        guide = replace(guide, importance=survival.importance, density=survival.density)
+    if vpls_per_path > 0.0:
+        guide = replace(guide, paths=max(min(round(_VPLS_PER_PATH / vpls_per_path), max_paths), 1))
+    decisions = {"guided_emitters": guided_scene, "guided_far_lights": photon_target, "guided_vpls": survival}
+    for name, result in decisions.items():
+        launcher.profile.counts[name] = int(result is not None)
     return guide

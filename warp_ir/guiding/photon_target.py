@@ -1,6 +1,4 @@
-"""Close by which point the light of suns and skies passes on its way into the picture."""
-
-from typing import Any
+"""Photon targets: the point close to which the light of suns and skies passes on its way into the picture."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,24 +6,24 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
-from warp_ir.guiding.emitter_selection import BY_POWER, PRIOR, WORTH
+from warp_ir.guiding.emitter_selection import MIN_GAIN, POWER_FRACTION, PRIOR
 from warp_ir.guiding.probes import CameraProbes, clamp_outliers
 from warp_ir.lights import PhotonTarget
 from warp_ir.scene import LightKind
 
 Floats = npt.NDArray[np.float64]
 
-_RINGS = 16
-_AREAS = np.diff(0.25 ** np.arange(_RINGS - 1, -1, -1), prepend=0.0)
-"""Of the rings, over that of them all."""
-_EVERYWHERE = 0.95 * _AREAS + 0.05 / _RINGS
-"""Probabilities of the rings where nothing is known: none is so small that a float loses it."""
-_STEPS = 10
-_NEAR = 1.0e-3
-"""Of the spread of the samples: distances are not told apart below."""
+_ANNULI = 16
+_AREAS = np.diff(0.25 ** np.arange(_ANNULI - 1, -1, -1), prepend=0.0)
+"""Areas of the annuli, relative to the area of the whole disk."""
+_PRIOR_PROBABILITIES = 0.95 * _AREAS + 0.05 / _ANNULI
+"""Probabilities of the annuli without samples; none is too small for float32."""
+_ITERATIONS = 10
+_REGULARIZATION = 1.0e-3
+"""Smallest distance that is resolved, relative to the spread of the samples."""
 
 
-def learn_photon_target(scene: DeviceScene, seen: CameraProbes, launcher: Launcher) -> Any | None:
+def learn_photon_target(scene: DeviceScene, probes: CameraProbes, launcher: Launcher) -> "PhotonTarget | None":
     """The `PhotonTarget` of distant lights and domes, learned from camera probes; None if the gain is small."""
     data = scene.data
     centre, radius = np.array(data.centre, np.float64), float(data.radius)
@@ -33,65 +31,72 @@ def learn_photon_target(scene: DeviceScene, seen: CameraProbes, launcher: Launch
     focus = np.tile([*centre, radius], (rows, 1))
     cdf = np.tile(np.cumsum(_AREAS), (rows, 1))
     kinds, item = data.emitter_kind.numpy(), data.emitter_item.numpy()
-    far = (kinds == LightKind.DISTANT) | (kinds == LightKind.DOME)
+    at_infinity = (kinds == LightKind.DISTANT) | (kinds == LightKind.DOME)
     before = after = 0.0
-    for emitter in np.nonzero(far)[0]:
-        mine = (seen.emitter == emitter) & (seen.bounce > 0) & (seen.score > 0.0)
-        if not mine.any():
+    for emitter in np.nonzero(at_infinity)[0]:
+        selected = (probes.emitter == emitter) & (probes.bounce > 0) & (probes.score > 0.0)
+        if not selected.any():
             continue
-        points, ways, score, even = seen.position[mine], seen.target[mine, :3], seen.score[mine], seen.even[mine]
-        place = nearest_point(points, ways, score)
-        outer = radius + float(np.linalg.norm(place - centre))  # which covers the scene
-        halvings = -np.log2(np.maximum(_apart(points, ways, place) / outer, 2.0**-_RINGS))
-        ring = _RINGS - 1 - np.clip(halvings, 0, _RINGS - 1).astype(np.int64)
-        learned = _shares(ring[even], score[even])
-        before += score[~even].sum() * (radius / outer) ** 2
-        after += (score * (_AREAS / learned)[ring])[~even].sum()
-        focus[item[emitter]] = *place, outer
-        cdf[item[emitter]] = np.cumsum(_shares(ring, score))
-    if before <= WORTH * after:
+        points, directions, score, training = (
+            probes.position[selected],
+            probes.target[selected, :3],
+            probes.score[selected],
+            probes.training[selected],
+        )
+        point = nearest_point(points, directions, score)
+        outer_radius = radius + float(np.linalg.norm(point - centre))  # so that the disk covers the scene
+        halvings = -np.log2(np.maximum(_distance_to_lines(points, directions, point) / outer_radius, 2.0**-_ANNULI))
+        annulus = _ANNULI - 1 - np.clip(halvings, 0, _ANNULI - 1).astype(np.int64)
+        probability = _annulus_probabilities(annulus[training], score[training])
+        before += score[~training].sum() * (radius / outer_radius) ** 2
+        after += (score * (_AREAS / probability)[annulus])[~training].sum()
+        focus[item[emitter]] = *point, outer_radius
+        cdf[item[emitter]] = np.cumsum(_annulus_probabilities(annulus, score))
+    if before <= MIN_GAIN * after:
         return None
     photon_target = PhotonTarget()
-    photon_target.rings = _RINGS
+    photon_target.rings = _ANNULI
     photon_target.focus = launcher.array(focus, wp.vec4)
     photon_target.cdf = launcher.array(np.pad(cdf / cdf[:, -1:], ((0, 0), (1, 0))).reshape(-1), wp.float32)
     return photon_target
 
 
-def _shares(ring: npt.NDArray[np.int64], score: Floats) -> Floats:
-    """Probabilities of the rings."""
-    sums = np.bincount(ring, clamp_outliers(score), _RINGS)
+def _annulus_probabilities(annulus: npt.NDArray[np.int64], score: Floats) -> Floats:
+    """Probabilities of the annuli, float64 [annuli], learned from the scores of samples in them."""
+    sums = np.bincount(annulus, clamp_outliers(score), _ANNULI)
     total = sums.sum()
     if not total > 0.0:
-        return _EVERYWHERE
-    trust = (1.0 - BY_POWER) / (1.0 + PRIOR * (score**2).sum() / total**2)
-    # A sample stands for its neighbours, too.
+        return _PRIOR_PROBABILITIES
+    trust = (1.0 - POWER_FRACTION) / (1.0 + PRIOR * (score**2).sum() / total**2)
+    # A sample counts for the neighbouring annuli as well.
     smooth = np.convolve(np.pad(sums, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
-    return np.asarray(trust * smooth / smooth.sum() + (1.0 - trust) * _EVERYWHERE)
+    return np.asarray(trust * smooth / smooth.sum() + (1.0 - trust) * _PRIOR_PROBABILITIES)
 
 
-def nearest_point(points: Floats, ways: Floats, weight: Floats) -> Floats:
+def nearest_point(points: Floats, directions: Floats, weight: Floats) -> Floats:
     """The point [3] to which lines have the least weighted sum of distances (Weiszfeld's iteration).
 
-    Along parallel lines it is where the points are that they go through.
+    For parallel lines it is the point, along them, at the mean of the given points.
 
     Args:
-        points: On each line, float64 [n, 3].
-        ways: Unit, float64 [n, 3].
-        weight: float64 [n].
+        points: A point on each line, float64 [n, 3].
+        directions: Unit direction of each line, float64 [n, 3].
+        weight: Weight of each line, float64 [n].
     """
-    place = middle = np.average(points, axis=0, weights=weight)
+    point = middle = np.average(points, axis=0, weights=weight)
     spread = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weight)))
-    across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
-    for _ in range(_STEPS):
-        w = weight / np.maximum(_apart(points, ways, place), _NEAR * max(spread, _NEAR))
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    for _ in range(_ITERATIONS):
+        w = weight / np.maximum(
+            _distance_to_lines(points, directions, point), _REGULARIZATION * max(spread, _REGULARIZATION)
+        )
         w /= w.sum()
-        system = np.einsum("n,nij->ij", w, across) + _NEAR * np.eye(3)
-        place = np.linalg.solve(system, np.einsum("n,nij,nj->i", w, across, points) + _NEAR * middle)
-    return np.asarray(place)
+        system = np.einsum("n,nij->ij", w, across) + _REGULARIZATION * np.eye(3)
+        point = np.linalg.solve(system, np.einsum("n,nij,nj->i", w, across, points) + _REGULARIZATION * middle)
+    return np.asarray(point)
 
 
-def _apart(points: Floats, ways: Floats, place: Floats) -> Floats:
-    """Distances of a place from lines."""
-    to = points - place
-    return np.asarray(np.linalg.norm(to - (to * ways).sum(axis=1, keepdims=True) * ways, axis=1))
+def _distance_to_lines(points: Floats, directions: Floats, point: Floats) -> Floats:
+    """Distances of a point from lines, float64 [n]."""
+    to = points - point
+    return np.asarray(np.linalg.norm(to - (to * directions).sum(axis=1, keepdims=True) * directions, axis=1))

@@ -1,16 +1,14 @@
-"""Where light paths begin and which VPLs are kept, so that the camera feels them; `pilot` learns it.
+"""A guide: the probabilities by which light paths start where they matter to the picture; `guiding` learns them.
 
-A `Guide` is three probabilities, whose inverses are weights: whatever they are, the light is the same on the mean.
+A `Guide` holds three kinds of probabilities. Samples are weighted by their inverses, so guiding adds no bias.
 
-* Emitters are chosen by what they give to the picture: tables of the scene, in `Guide.scene`.
-* Photons from far away pass close by what they light: `lights.PhotonTarget`.
-* VPLs that give little to the picture are dropped at random, and those that are kept shine for them (Georgiev and
-  Slusallek 2010). What a VPL gives is its intensity times the
-  `VplImportance` of the cell of space and direction that it is in.
+* Selection probabilities of emitters: tables of the scene, in `Guide.scene`.
+* The places where photons of lights at infinity enter the scene: `lights.PhotonTarget`.
+* Survival probabilities of VPLs, by their contribution to the picture (Georgiev and Slusallek 2010). The contribution
+  of a VPL is its intensity times the `VplImportance` of the cell of positions and directions that it lies in.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import warp as wp
 
@@ -21,27 +19,29 @@ from warp_ir.lights import PhotonTarget
 wp.set_module_options({"enable_backward": False})
 
 CELLS = 32
-"""Along each edge of the cube around the scene."""
+"""Number of cells along each edge of the cube around the scene."""
 _CELLS = wp.constant(CELLS)
 SIDES = 6
-"""Directions of the normal."""
+"""Number of directions of the normal that are told apart: the sides of a cube."""
 MIN_SURVIVAL = 0.2
-"""Probability with which the most useless VPL is kept: no weight is more than five times as large."""
+"""Least survival probability of a VPL: no weight grows by more than a factor of five."""
 _MIN_SURVIVAL = wp.constant(MIN_SURVIVAL)
 
 
 @wp.struct
 class VplImportance:
-    """What VPLs on surfaces give to the picture."""
+    """Contribution of VPLs on surfaces to the picture."""
 
-    known: int  # 0: it is not; all VPLs are kept
-    extent: float  # edge of the cube, around the origin
-    per_intensity: wp.array[wp.float32]  # [sides, cells, cells, cells]; times the intensity of all channels: 1 is much
+    known: int  # 0: not learned; all VPLs survive
+    extent: float  # edge length of the cube, which is centred at the origin
+    per_intensity: wp.array[
+        wp.float32
+    ]  # [sides, cells, cells, cells]; times the sum of the intensity's channels: the survival probability
 
 
 @wp.func
 def cell_of(position: wp.vec3, normal: wp.vec3, extent: float) -> int:
-    """The cell of a VPL: where it is, and to which side of the cube it faces."""
+    """The cell of a VPL, by its position and the side of the cube that its normal faces."""
     axis = int(0)
     if wp.abs(normal[1]) > wp.abs(normal[axis]):
         axis = 1
@@ -55,31 +55,31 @@ def cell_of(position: wp.vec3, normal: wp.vec3, extent: float) -> int:
 
 @wp.func
 def survival_probability(importance: VplImportance, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3) -> float:
-    """With which a VPL is kept."""
-    gives = importance.per_intensity[cell_of(position, normal, importance.extent)] * (
+    """Survival probability of a VPL."""
+    contribution = importance.per_intensity[cell_of(position, normal, importance.extent)] * (
         intensity[0] + intensity[1] + intensity[2]
     )
-    return wp.clamp(gives, _MIN_SURVIVAL, 1.0)
+    return wp.clamp(contribution, _MIN_SURVIVAL, 1.0)
 
 
 @dataclass(frozen=True)
 class Guide:
-    """Where light paths begin, and which of their VPLs are kept."""
+    """Where light paths start, and which of their VPLs survive."""
 
     scene: DeviceScene
-    """The scene; its emitters are chosen with the probabilities that pay."""
-    photon_target: Any
-    """The `PhotonTarget` of photons from far away."""
-    importance: Any
-    """The `VplImportance` of VPLs."""
+    """The scene, with the selection probabilities of its emitters."""
+    photon_target: PhotonTarget
+    """Where photons of lights at infinity enter the scene."""
+    importance: VplImportance
+    """Contribution of VPLs, from which their survival probability follows."""
     paths: int = 1
-    """Light paths to start for each that is asked for, to make up for what is dropped."""
+    """Number of light paths to start for each that is asked for, to make up for VPLs that do not survive."""
     density: float = 1.0
-    """Of VPLs, where they count, over that on all surfaces."""
+    """Density of surviving VPLs where they matter, relative to the mean over all surfaces."""
 
 
 def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
-    """Light paths begin in proportion to power, and all VPLs are kept."""
+    """A guide by which light paths start in proportion to power, and all VPLs survive."""
     photon_target, importance = PhotonTarget(), VplImportance()
     photon_target.focus, photon_target.cdf = (
         launcher.empty(1, wp.vec4),
