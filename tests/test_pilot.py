@@ -123,7 +123,7 @@ def test_the_same_bits(wide, tmp_path):
     assert np.array_equal(whole.radiance(), film_of(scene, iterations=4, threads=3).radiance())
     film_of(scene, iterations=2).save(tmp_path / "film.npz")
     settings = ir.RenderSettings(width=24, height=24, filter=False, light_paths=64, iterations=4)
-    renderer = Renderer(scene, settings)
+    renderer = Renderer(scene, settings, guiding=ALWAYS)
     film = renderer.new_film()
     film.resume(tmp_path / "film.npz")
     assert np.array_equal(renderer.render(film).radiance(), whole.radiance())
@@ -192,9 +192,9 @@ def test_both_halves_of_the_probes_see_the_picture():
     """What is learned from one half of the camera paths is measured by the other: both are spread over the image."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=64, height=64, filter=False))
     camera = renderer._shutter[0].camera
-    seen = trace_camera_probes(renderer.scene, camera, renderer.launcher, 1024, renderer.settings)
+    seen = trace_camera_probes(renderer.scene, camera, renderer.launcher, 1024, renderer.settings.resolve())
     middle = np.median(seen.position[seen.bounce == 0, :2], axis=0)
-    for half in (seen.even, ~seen.even):
+    for half in (seen.training, ~seen.training):
         beyond = (seen.position[half & (seen.bounce == 0), :2] > middle).mean(axis=0)
         assert np.all(np.abs(beyond - 0.5) < 0.05)
 

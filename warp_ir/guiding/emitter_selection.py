@@ -26,8 +26,8 @@ def learn_emitter_probabilities(scene: DeviceScene, probes: CameraProbes, launch
         return None
     power = np.diff(scene.data.emitter_cdf.numpy().astype(np.float64))
     power = np.maximum(power, np.finfo(np.float32).tiny)  # a probability too small for float32
-    learned = probabilities(power, probes.emitter[probes.even], probes.score[probes.even])
-    emitter, squares = probes.emitter[~probes.even], probes.score[~probes.even] ** 2
+    learned = probabilities(power, probes.emitter[probes.training], probes.score[probes.training])
+    emitter, squares = probes.emitter[~probes.training], probes.score[~probes.training] ** 2
     if squares.sum() <= MIN_GAIN * (squares * (power / learned)[emitter]).sum():
         return None
     return _with_probabilities(scene, power, probabilities(power, probes.emitter, probes.score), launcher)
