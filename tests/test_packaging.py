@@ -22,8 +22,9 @@ def fresh(code):
 
 
 def test_version_is_the_same_everywhere():
-    """Package, metadata and changelog agree."""
-    assert f'version = "{warp_ir.__version__}"' in PROJECT.splitlines()
+    """The package alone holds the version: the metadata take it from there, and the changelog agrees."""
+    assert 'version = { attr = "warp_ir.__version__" }' in PROJECT.splitlines()
+    assert 'dynamic = ["version"]' in PROJECT.splitlines() and 'version = "' not in PROJECT
     assert f"## [{warp_ir.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
@@ -47,14 +48,32 @@ def test_readme_render_command_parses():
     assert (ROOT / "scenes_usd" / "cornell_box.usda").is_file()
 
 
-@pytest.mark.parametrize(
-    "name", ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/api.md", "docs/usd.md", "benchmarks/README.md"]
+DOCUMENTS = sorted(
+    str(path.relative_to(ROOT))
+    for folder in (".", "docs", "docs/design", "benchmarks")
+    for path in ROOT.glob(f"{folder}/*.md")
 )
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
 def test_links_lead_somewhere(name):
     """Every relative link is a file, pictures included."""
     path = ROOT / name
     links = re.findall(r"\]\((?!http)([^)#]+)\)", path.read_text(encoding="utf-8"))
     assert [to for to in links if not (path.parent / to).exists()] == []
+
+
+@pytest.mark.parametrize("name", [name for name in DOCUMENTS if name.startswith("docs/design/")])
+def test_decisions_are_held_by_what_exists(name):
+    """Every decision has its four parts, and the tests and files that a page names are there."""
+    text = (ROOT / name).read_text(encoding="utf-8")
+    for file, test in re.findall(r"(tests/[\w/]+\.py)::(\w+)", text):
+        assert f"def {test}(" in (ROOT / file).read_text(encoding="utf-8"), f"{file}::{test}"
+    paths = re.findall(r"`([\w/]+/[\w]+\.(?:py|md))`", text)
+    assert [path for path in paths if not (ROOT / path).exists() and not (ROOT / "warp_ir" / path).exists()] == []
+    decisions = [part for part in text.split("\n## ")[1:] if not part.startswith("Known limits")]
+    parts = "**Context.**", "**Decision.**", "**What it costs.**", "**Held by.**"
+    assert all(part in decision for decision in decisions for part in parts)
 
 
 def test_pictures_are_small():
