@@ -215,7 +215,9 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         default=TONEMAPS[0],
         help="tone curve of .png and .jpg: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
-    output.add_argument("--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16")
+    output.add_argument(
+        "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
+    )
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)
@@ -228,7 +230,9 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
 def _add_info(parser: argparse.ArgumentParser) -> None:
     _add_stage(parser, frames=False)
     parser.add_argument("--json", action="store_true", help="print JSON, for programs")
-    parser.add_argument("--list", choices=LISTS, metavar="WHAT", help=f"print only these, one per line: {', '.join(LISTS)}")
+    parser.add_argument(
+        "--list", choices=LISTS, metavar="WHAT", help=f"print only these, one per line: {', '.join(LISTS)}"
+    )
 
 
 def _add_vpls(parser: argparse.ArgumentParser) -> None:
@@ -302,7 +306,9 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         spec = "frames to render: 101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"
         when.add_argument("--frames", "-f", metavar="SPEC", help=spec)
     when.add_argument("--time", type=_finite, metavar="CODE", help="time code (default: the stage's start)")
-    when.add_argument("--default-time", "-d", action="store_true", help="use the default values of attributes: nothing is animated")
+    when.add_argument(
+        "--default-time", "-d", action="store_true", help="use the default values of attributes: nothing is animated"
+    )
     when.add_argument("--defaultTime", dest="default_time", action="store_true", help=hidden)
     render_settings = "RenderSettings prim to use (default: the one that the stage names, or its first)"
     group.add_argument("--render-settings", "-rs", metavar="PRIM", help=render_settings)
@@ -329,7 +335,7 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         type=_paths,
         default=[],
         metavar="PRIM[,PRIM]",
-        help="load only these prims, their ancestors, their descendants and what they refer to; name the lights as well",
+        help="load only these prims, their ancestors and descendants, and what they refer to; lights must be named too",
     )
     group.add_argument(
         "--variant",
