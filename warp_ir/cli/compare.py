@@ -21,7 +21,6 @@ from warp_ir.cli.arguments import METHODS, settings_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, time_code_of
-from warp_ir.film.denoise import require_denoiser
 from warp_ir.image.io import check_output, whole_file
 from warp_ir.metrics import mean_ratio, relative_mse
 from warp_ir.scene import Floats, InputError, Scene
@@ -230,6 +229,8 @@ def _methods(args: argparse.Namespace) -> list[str]:
     Raises:
         InputError: No method is given, or the denoiser of a given one is not installed.
     """
+    from warp_ir.film.denoise import require_denoiser  # imports Warp
+
     if args.methods is not None:
         if not args.methods:
             raise InputError(f"--methods: names no method; known are {', '.join(METHODS)}")

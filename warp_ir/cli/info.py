@@ -157,13 +157,13 @@ def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
     """What the stage does not specify, and what was chosen for it."""
     guesses = {}
     if scene.camera.name not in cameras:
-        guesses["camera"] = "the stage has none: one that frames the scene from outside"
+        guesses["camera"] = "one that frames the scene from outside (the stage has none)"
     elif any("rendered because it is the first" in line for line in scene.warnings):
         guesses["camera"] = f"the first of {len(cameras)}"
     if any("used because they are the first of" in line for line in scene.warnings):
         guesses["settings"] = "the first RenderSettings of the stage"
     if any(light.name == "default dome" for light in scene.lights):
-        guesses["light"] = "nothing emits: a white dome of radiance 1"
+        guesses["light"] = "a white dome of radiance 1 (nothing emits)"
     return guesses
 
 
@@ -213,7 +213,9 @@ def _print_table(facts: dict[str, Any], max_lines: float) -> None:
     _list("lights", _light_lines(facts), max_lines)
     _list("mesh lights", _mesh_light_lines(facts), max_lines)
     _list("materials", _material_lines(facts), max_lines)
-    _row("cost", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory: {_parts(cost)}")
+    _row(
+        "costs", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory: {_parts(cost)}"
+    )
     _list("skipped", [f"{value} {key.replace('_', ' ')}" for key, value in facts["skipped"].items()], max_lines)
     _list("guessed", [f"{key}: {value}" for key, value in facts["guessed"].items()], max_lines)
     counts = {key.replace("_", " "): value for key, value in facts["counts"].items() if value}
