@@ -1,4 +1,4 @@
-"""From runs to statements: medians, errors at equal time, ratios to an earlier result."""
+"""Evaluates runs: medians over seeds, errors at equal time, ratios to an earlier result."""
 
 import math
 import statistics
@@ -8,19 +8,20 @@ from typing import Any
 from report import Table, number
 
 RESOLUTION = 0.05
-"""Errors below this share of the reference's own relMSE cannot be told apart, and count as this share."""
-WORSE = 1.10
-"""Time x error that has grown by more than this is marked, and fails the comparison."""
+"""Errors below this share of the reference's own relMSE cannot be distinguished, and count as this share."""
+REGRESSION = 1.10
+"""A result whose time x error has grown by more than this factor is marked, and fails the comparison."""
 TARGETS = {"cornell_box": 10.0, "crowded_room": 10.0, "corridor": 50.0}
-"""How many times less error than path tracing at equal time we want."""
+"""Goal by scene: Mitsuba's path tracing error divided by ours, at equal time."""
 DENOISED_TARGET = 2.0
-"""And how many times less than the denoised peer, everywhere."""
+"""Goal for all scenes: the error of the denoised peer divided by ours, at equal time."""
 
 Row = dict[str, Any]
+"""A run, or the medians of several: names and numbers as in the JSON file."""
 
 
 def summarize(runs: Iterable[Row]) -> list[Row]:
-    """One row for every (scene, method, budget): medians over the seeds, and the spread of the error."""
+    """The medians over the seeds and the range of the error, one row for each scene, method and time budget."""
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["scene"], run["method"], run["budget"]), []).append(run)
@@ -35,14 +36,15 @@ def summarize(runs: Iterable[Row]) -> list[Row]:
 
 
 def resolved(row: Row, key: str = "error") -> float:
-    """An error that can be divided by: not below what the reference resolves."""
+    """The error, at least the resolution of the reference: ratios of such errors are meaningful."""
     return max(row[key], RESOLUTION * row["floor"], 1e-12)
 
 
 def error_at(curve: list[Row], seconds: float) -> float | None:
-    """The error that a method has after `seconds`, read off its measured curve; None long before its first picture.
+    """The error of a method after `seconds`, interpolated in its measured curve; None long before its first picture.
 
-    Straight lines on log-log paper; beyond the ends the nearest one goes on, not steeper than 1/time and not rising.
+    The interpolation is linear in the logarithms. Beyond the ends the nearest segment is extrapolated, with an exponent
+    between that of 1/time and 0.
     """
     points = sorted((math.log(row["seconds"]), math.log(resolved(row))) for row in curve)
     x = math.log(seconds)
@@ -55,19 +57,19 @@ def error_at(curve: list[Row], seconds: float) -> float | None:
     slope = (y1 - y0) / max(x1 - x0, 1e-9)
     if x0 <= x <= x1:
         return math.exp(y0 + slope * (x - x0))
-    near = (x0, y0) if x < x0 else (x1, y1)
-    return math.exp(near[1] + min(max(slope, -1.0), 0.0) * (x - near[0]))
+    end = (x0, y0) if x < x0 else (x1, y1)
+    return math.exp(end[1] + min(max(slope, -1.0), 0.0) * (x - end[0]))
 
 
 def advantage(row: Row, rows: list[Row], peer: str) -> float | None:
-    """The peer's error over ours at equal time; None where it has no picture by then."""
+    """The peer's error divided by ours at equal time; None if the peer has no picture by then."""
     curve = [other for other in rows if other["scene"] == row["scene"] and other["method"] == peer]
     error = error_at(curve, row["seconds"]) if curve else None
     return None if error is None else error / resolved(row)
 
 
 def error_tables(rows: list[Row], peers: list[str]) -> list[Table]:
-    """Error against time, scene by scene, and how that compares with the peers at equal time."""
+    """Error against time, one table for each scene, with the ratios to the peers at equal time."""
     tables = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         chosen = [row for row in rows if row["scene"] == scene]
@@ -87,18 +89,18 @@ def error_tables(rows: list[Row], peers: list[str]) -> list[Table]:
                 )
             )
         columns = ("method", "budget s", "seconds", "samples", "relMSE", "spread", "mean", *(f"× {p}" for p in peers))
-        note = f"The reference's own relMSE, subtracted: {number(chosen[0]['floor'], 2)}."
+        note = f"The reference's own relMSE, which is subtracted: {number(chosen[0]['floor'], 2)}."
         tables.append(Table(f"{scene}: error against time", columns, lines, note))
     return tables
 
 
 def target_table(rows: list[Row], peers: list[str]) -> Table | None:
-    """How far the best of ours is from what we want: the worst and the best of the budgets."""
+    """The ratios of our best method to the goals, for the worst and for the best time budget."""
     lines = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         own = [row for row in rows if row["scene"] == scene and row["method"] not in peers]
         for peer in peers:
-            wanted = TARGETS.get(scene) if peer == "mitsuba" else DENOISED_TARGET
+            goal = TARGETS.get(scene) if peer == "mitsuba" else DENOISED_TARGET
             by_budget: dict[float, tuple[float, str]] = {}
             for row in own:
                 if (ratio := advantage(row, rows, peer)) is not None:
@@ -106,15 +108,15 @@ def target_table(rows: list[Row], peers: list[str]) -> Table | None:
                     by_budget[row["budget"]] = max(best, (ratio, row["method"]))
             if by_budget:
                 low, high = min(by_budget.values()), max(by_budget.values())
-                reached = "" if wanted is None else ("yes" if low[0] >= wanted else "no")
+                reached = "" if goal is None else ("yes" if low[0] >= goal else "no")
                 methods = ", ".join(dict.fromkeys((low[1], high[1])))
-                lines.append((scene, peer, number(low[0]), number(high[0]), methods, number(wanted), reached))
-    columns = ("scene", "peer", "worst budget", "best budget", "by", "wanted", "reached")
-    return Table("How many times less error than the peers, at equal time", columns, lines) if lines else None
+                lines.append((scene, peer, number(low[0]), number(high[0]), methods, number(goal), reached))
+    columns = ("scene", "peer", "worst budget", "best budget", "by", "goal", "reached")
+    return Table("Error of the peers divided by ours, at equal time", columns, lines) if lines else None
 
 
 def breakdown_tables(runs: list[Row]) -> list[Table]:
-    """Where the time of our methods goes, and what is done in it; at the longest budget, over all seeds."""
+    """The time of our methods by phase, and their work per second; at the longest budget, over all seeds."""
     longest: dict[tuple[str, str], list[Row]] = {}
     for run in sorted(runs, key=lambda run: run["budget"]):
         chosen = longest.setdefault((run["scene"], run["method"]), [])
@@ -122,13 +124,13 @@ def breakdown_tables(runs: list[Row]) -> list[Table]:
             longest[run["scene"], run["method"]] = [r for r in chosen if r["budget"] == run["budget"]] + [run]
 
     def sums(key: str) -> dict[tuple[str, str], dict[str, float]]:
-        """Of every phase or count, per second of rendering."""
+        """Every phase or count, per second of rendering, by scene and method."""
         result = {}
-        for where, group in longest.items():
+        for case, group in longest.items():
             seconds = sum(run["seconds"] for run in group)
             names = dict.fromkeys(name for run in group for name in run[key])
-            result[where] = {name: sum(run[key].get(name, 0.0) for run in group) / seconds for name in names}
-        return {where: values for where, values in result.items() if values}
+            result[case] = {name: sum(run[key].get(name, 0.0) for run in group) / seconds for name in names}
+        return {case: values for case, values in result.items() if values}
 
     def table(title: str, values: dict[tuple[str, str], dict[str, float]], form: str, note: str = "") -> Table:
         names = list(dict.fromkeys(name for row in values.values() for name in row))
@@ -141,26 +143,26 @@ def breakdown_tables(runs: list[Row]) -> list[Table]:
     shares = sums("timings")
     for row in shares.values():
         row["other"] = 1.0 - sum(row.values())
-    return [table("Where the time goes", shares, ".0%"), table("Work per second", sums("counts"), ".3g")]
+    return [table("Time by phase", shares, ".0%"), table("Work per second", sums("counts"), ".3g")]
 
 
 def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
-    """Time x error of this result over that of an earlier one, and whether any has become worse than `WORSE`.
+    """Time x error divided by that of an earlier result, and whether any has grown by more than `REGRESSION`.
 
     Peers are compared as well: if theirs change, the machine has changed and not the code.
     """
-    before = {(row["scene"], row["method"], row["budget"]): row for row in old}
+    earlier_rows = {(row["scene"], row["method"], row["budget"]): row for row in old}
     lines, worse = [], False
     for row in new:
-        earlier = before.get((row["scene"], row["method"], row["budget"]))
+        earlier = earlier_rows.get((row["scene"], row["method"], row["budget"]))
         if earlier is None:
             continue
         seconds = row["seconds"] / earlier["seconds"]
         error = resolved(row) / resolved(earlier)
         merit = seconds * error
-        mark = "WORSE" if merit > WORSE else "better" if merit < 1.0 / WORSE else ""
-        worse |= merit > WORSE
+        mark = "WORSE" if merit > REGRESSION else "better" if merit < 1.0 / REGRESSION else ""
+        worse |= merit > REGRESSION
         cells = (number(row["budget"]), number(seconds), number(error), number(merit), mark)
         lines.append((row["scene"], row["method"], *cells))
     columns = ("scene", "method", "budget s", "time ratio", "error ratio", "time x error", "")
-    return Table("Against the earlier result", columns, lines), worse
+    return Table("Comparison with the earlier result", columns, lines), worse

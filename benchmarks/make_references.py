@@ -1,26 +1,26 @@
-"""Make the reference pictures of `benchmarks/references/` with Mitsuba 3, a renderer that shares no code with ours.
+"""Makes the reference pictures in `benchmarks/references/` with Mitsuba 3, which shares no code with our renderer.
 
     python benchmarks/make_references.py [NAME ...] [--seconds S] [--variant llvm_ad_rgb] [--png FOLDER]
 
-Each scene is translated from the host `Scene` record to Mitsuba, and rendered in independent passes until its error
-target or its time is reached. An .npz of a picture holds `mean` and `standard_error` (float32 [height, width, 3],
-linear radiance), `floor` (its own relMSE, from the standard error) and the provenance as strings.
+Each `Scene` is translated to Mitsuba and rendered in independent passes until its error target or its time limit is
+reached. The .npz file of a picture holds `mean` and `standard_error` (float32 [height, width, 3], linear radiance),
+`floor` (relMSE of the mean, from the standard error) and its provenance as strings.
 
-The variant `llvm_ad_rgb` needs LLVM 16 or newer (Debian: libllvm19), found by itself or at DRJIT_LIBLLVM_PATH;
-without it the script falls back to `scalar_rgb`, which gives the same pictures more slowly.
+The variant `llvm_ad_rgb` needs LLVM 16 or newer (Debian: libllvm19), which is found automatically or at
+DRJIT_LIBLLVM_PATH; without it the script uses `scalar_rgb`, which gives the same pictures more slowly.
 
-What had to be matched:
+The two renderers differ, and the translation compensates for it:
 
-* Our lights cast light, block no ray and are not seen. Here they are shapes with a `null` surface, through which
-  `volpath` lets both paths and shadow rays pass (`path` would be blocked), and `hide_emitters`.
+* Our lights emit light, block no ray and are hidden from the camera. In Mitsuba they are shapes with a `null` surface,
+  through which `volpath` lets both paths and shadow rays pass (`path` would be blocked), and `hide_emitters` is set.
 * Mitsuba has no DISTANT light with an angle: it becomes a disk so far away (1000 times the scene's extent) that it
-  fills the same cone; from place to place in the scene its direction then differs by at most 0.001 rad.
-* Shading normals count at every bounce there, and only for camera rays here: reference scenes are faceted, where
+  fills the same cone; its direction then varies by at most 0.001 rad over the scene.
+* Mitsuba uses shading normals at every bounce, we use them only for camera rays: reference scenes are faceted, where
   the two agree.
-* An emissive mesh emits from its front only, as here; one that is `double_sided` is refused.
-* Textures are what `load_usd` makes of them; `loader_warnings` in the .npz tells when that was their mean.
-* `thin_walls` has no picture: Mitsuba's shadow rays end a thousandth short of the light, so they skip a wall that
-  close to one, and its dark box measures 0.001 instead of 0.
+* An emissive mesh emits from its front only, as in our renderer; a `double_sided` one is refused.
+* Textures are those that `load_usd` returns; `loader_warnings` in the .npz says if one was replaced by its mean.
+* `thin_walls` has no reference: Mitsuba's shadow rays end a thousandth before the light, so they miss a wall that
+  is closer to it, and the dark box has radiance 0.001 instead of 0.
 """
 
 import argparse
@@ -29,16 +29,24 @@ import hashlib
 import os
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import warp_ir as ir
-from warp_ir.scene import Camera, Light, LightKind, Mesh, Projection, Scene, Texture, Wrap
+from warp_ir.scene import Camera, Floats, Light, LightKind, Mesh, Projection, Scene, Texture, Wrap
+
+if TYPE_CHECKING:
+    import mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = Path(__file__).resolve().parent / "references"
 
+Description = dict[str, Any]
+"""A plugin with its parameters, as `mitsuba.load_dict` takes it."""
 PICTURES = {
     # name: (scene, width, height, max_bounces)
     "cornell_box": ("cornell_box", 128, 128, None),
@@ -50,18 +58,18 @@ PICTURES = {
     "thousand_lights": ("thousand_lights", 64, 64, None),
     "two_rooms": ("two_rooms", 96, 72, None),
 }
-"""The pictures that are stored; every one is a scene of `scenes_usd/`."""
+"""The stored pictures, each of a scene in `scenes_usd/`."""
 
 TARGET_FLOOR = 1e-4
-"""relMSE of the reference itself at which it is good enough."""
+"""relMSE of the reference itself at which rendering stops."""
 
 
-def use_mitsuba(variant: str = "llvm_ad_rgb"):
-    """Import Mitsuba with `variant`, or with `scalar_rgb` where LLVM is missing."""
+def use_mitsuba(variant: str = "llvm_ad_rgb") -> ModuleType:
+    """Imports Mitsuba with `variant`, or with `scalar_rgb` if LLVM is missing."""
     if variant.startswith("llvm") and "DRJIT_LIBLLVM_PATH" not in os.environ:
-        found = [ctypes.util.find_library(f"LLVM-{version}") for version in range(22, 15, -1)]
-        if any(found):
-            os.environ["DRJIT_LIBLLVM_PATH"] = next(filter(None, found))
+        libraries = [ctypes.util.find_library(f"LLVM-{version}") for version in range(22, 15, -1)]
+        if any(libraries):
+            os.environ["DRJIT_LIBLLVM_PATH"] = next(filter(None, libraries))
         else:
             print("LLVM 16 or newer not found: using scalar_rgb", file=sys.stderr)
             variant = "scalar_rgb"
@@ -71,25 +79,25 @@ def use_mitsuba(variant: str = "llvm_ad_rgb"):
     return mi
 
 
-def relative_mse_floor(mean: np.ndarray, standard_error: np.ndarray) -> float:
+def relative_mse_floor(mean: Floats, standard_error: Floats) -> float:
     """Expected relMSE of a perfect picture against this reference."""
     return float(np.mean(standard_error**2 / (mean**2 + 0.01 * mean.mean() ** 2)))
 
 
-def _rgb(color) -> dict:
-    """A reflectance or radiance as Mitsuba wants it."""
+def _rgb(color: Iterable[float]) -> Description:
+    """The Mitsuba description of a reflectance or radiance."""
     return {"type": "rgb", "value": [float(c) for c in color]}
 
 
-def _bitmap(mi, texture: Texture) -> dict:
-    """An image as Mitsuba wants it."""
+def _bitmap(mi: ModuleType, texture: Texture) -> Description:
+    """The Mitsuba description of an image."""
     wrap = {Wrap.CLAMP: "clamp", Wrap.REPEAT: "repeat", Wrap.MIRROR: "mirror"}[texture.wrap[0]]
     pixels = np.broadcast_to(texture.pixels, (*texture.pixels.shape[:2], 3)).astype(np.float32)
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": wrap}
 
 
-def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
-    """The triangles of `mesh` that have material `index`, as a Mitsuba mesh with unshared corners."""
+def _mesh(mi: ModuleType, mesh: Mesh, scene: Scene, index: int) -> "mitsuba.Mesh":
+    """The triangles of `mesh` that have material `index`, as a Mitsuba mesh with three vertices per triangle."""
     chosen = mesh.material == index
     material = scene.materials[index]
     emissive = any(value > 0.0 for value in material.emission)
@@ -134,8 +142,8 @@ def _mesh(mi, mesh: Mesh, scene: Scene, index: int):
     return result
 
 
-def _light(mi, light: Light, centre: np.ndarray, extent: float) -> dict:
-    """A Mitsuba emitter, or a shape with one that lets every ray pass."""
+def _light(mi: ModuleType, light: Light, centre: Floats, extent: float) -> Description:
+    """The Mitsuba description of an emitter, or of an emitting shape that blocks no ray."""
     transform = mi.ScalarTransform4f
     world = transform(light.world_from_light)
     shape = {"emitter": {"type": "area", "radiance": _rgb(light.radiance)}, "surface": {"type": "null"}}
@@ -164,13 +172,13 @@ def _light(mi, light: Light, centre: np.ndarray, extent: float) -> dict:
             distance = 1000.0 * extent
             radius = distance * np.tan(np.radians(light.angle / 2))
             origin, side = centre - distance * direction, np.roll(direction, 1)
-            look = transform().look_at(origin=origin.tolist(), target=centre.tolist(), up=side.tolist())
-            return {"type": "disk", "to_world": look @ transform().scale([radius, radius, 1]), **shape}
+            orientation = transform().look_at(origin=origin.tolist(), target=centre.tolist(), up=side.tolist())
+            return {"type": "disk", "to_world": orientation @ transform().scale([radius, radius, 1]), **shape}
     raise NotImplementedError(light.kind)
 
 
-def _sensor(mi, camera: Camera, extent: float, width: int, height: int) -> dict:
-    """The camera, its film box-filtered like ours."""
+def _sensor(mi: ModuleType, camera: Camera, extent: float, width: int, height: int) -> Description:
+    """The Mitsuba description of the camera, with a box filter like ours."""
     left, right, bottom, top = camera.fit(width, height).window
     mirror = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +Z with X to the left
     to_world = mi.ScalarTransform4f(camera.world_from_camera @ mirror)
@@ -192,21 +200,24 @@ def _sensor(mi, camera: Camera, extent: float, width: int, height: int) -> dict:
     }
 
 
-def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = None):
-    """The same scene in Mitsuba, ready for `mitsuba.render`.
+def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = None) -> "mitsuba.Scene":
+    """Translates a scene to Mitsuba, ready for `mitsuba.render`.
 
     Args:
-        scene: What to translate.
-        width: Of the picture, in pixels.
-        height: Of the picture, in pixels.
-        max_bounces: As in `RenderSettings`: 0 is emission and direct light; None for no limit.
+        scene: Scene to translate.
+        width: Width of the picture in pixels.
+        height: Height of the picture in pixels.
+        max_bounces: As in `RenderSettings`: 0 is emission and direct light; None: no limit.
+
+    Raises:
+        NotImplementedError: The scene has a feature that Mitsuba lacks.
     """
     import mitsuba as mi
 
     lower, upper = scene.bounds()
     emissive = any(max(material.emission) > 0.0 for material in scene.materials)
     if emissive and scene.lights:
-        raise NotImplementedError("lights that are hidden beside emissive surfaces that are seen")
+        raise NotImplementedError("hidden lights together with visible emissive surfaces")
     depth = -1 if max_bounces is None else max_bounces + 2
     result = {
         "type": "scene",
@@ -221,8 +232,10 @@ def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = 
     return mi.load_dict(result)
 
 
-def render_reference(mi, scene: Scene, width: int, height: int, max_bounces: int | None, seconds: float) -> dict:
-    """Passes of independent seeds until `TARGET_FLOOR` or `seconds` is reached; the arrays and counts to store."""
+def render_reference(
+    mi: ModuleType, scene: Scene, width: int, height: int, max_bounces: int | None, seconds: float
+) -> dict[str, Any]:
+    """Renders passes of independent seeds until `TARGET_FLOOR` or `seconds` is reached; returns what is stored."""
     translated = to_mitsuba(scene, width, height, max_bounces)
     spp = max(4, 2**18 // (width * height) * 4)  # about a million paths a pass
     passes, mean, squares = 0, 0.0, 0.0
@@ -248,16 +261,18 @@ def render_reference(mi, scene: Scene, width: int, height: int, max_bounces: int
 
 
 def digest(stage: Path) -> str:
-    """SHA-256 of a scene file: tells whether a stored reference still belongs to it."""
+    """SHA-256 of a scene file, by which a reference of another version is detected."""
     return hashlib.sha256(stage.read_bytes()).hexdigest()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}; all by default")
-    parser.add_argument("--seconds", type=float, default=300.0, help="the most that one picture may take")
-    parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")
-    parser.add_argument("--png", type=Path, metavar="FOLDER", help="write tone-mapped pictures here as well")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"pictures to render: {', '.join(PICTURES)} (default: all)"
+    )
+    parser.add_argument("--seconds", type=float, default=300.0, help="time limit for each picture (default: 300)")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (default: llvm_ad_rgb)")
+    parser.add_argument("--png", type=Path, metavar="FOLDER", help="also write tone-mapped pictures to this folder")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(PICTURES):
         parser.error(f"no such picture: {', '.join(sorted(unknown))}")

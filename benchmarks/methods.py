@@ -1,10 +1,10 @@
-"""What is compared: tasks (a scene, its picture and the truth about it), and our own ways to solve them.
+"""Tasks (a scene and its reference picture), and our own methods that render them.
 
-A method has three things, and the peers in `peers/` have the same ones:
+Our methods and the peers in `peers/` have the same interface, `Method`:
 
-    name                            for tables and for --estimators
-    prepare(task, budgets) -> dict  gets ready, until nothing is left to compile; seconds by step
-    render(seconds, seed) -> Run    a picture in about that time, and what it really took
+    name                            name in tables and for --estimators
+    prepare(task, budgets) -> dict  compiles and uploads everything; returns seconds by step
+    render(seconds, seed) -> Run    renders a picture in about that time and measures the time taken
 """
 
 import dataclasses
@@ -15,29 +15,32 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from make_references import PICTURES, REFERENCES, ROOT, digest
 
 import warp_ir as ir
 from warp_ir.settings import ESTIMATOR_NAMES
 
 SETUP = ("compile", "upload")
-"""Phases that happen once for a scene; what is timed is the rest of the call, whatever the film says it took."""
+"""Phases that happen once per scene. The measured time is that of the whole call without them."""
 KELLER_PATHS = 64
-"""Keller's estimator has no other knob: with the default an iteration would outlast the shorter budgets."""
+"""Light paths of `keller`: with the default number one iteration would take longer than the short budgets."""
+
+Pixels = npt.NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Task:
-    """A picture to make, the same for every method."""
+    """A picture to render, the same for every method."""
 
     name: str
     scene: ir.Scene
-    reference: np.ndarray
+    reference: Pixels
     """Radiance by an independent renderer, float32 [height, width, 3]."""
-    reference_error: np.ndarray
-    """Its standard error, float32 [height, width, 3]."""
+    reference_error: Pixels
+    """Standard error of the reference, float32 [height, width, 3]."""
     floor: float
-    """Its own relMSE, which every measured error contains and none is charged with."""
+    """relMSE of the reference itself, which is subtracted from every measured error."""
     max_bounces: int | None = None
 
     @property
@@ -51,12 +54,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Run:
-    """One picture and what it cost."""
+    """One picture and its cost."""
 
-    picture: np.ndarray
+    picture: Pixels
     """Linear radiance, [height, width, 3]."""
     seconds: float
-    """Wall time of the render alone, up to the picture in host memory."""
+    """Wall time of the render, up to the picture in host memory, without compilation and upload."""
     samples: int
     """Iterations, or samples per pixel."""
     timings: dict[str, float] = field(default_factory=dict)
@@ -66,7 +69,7 @@ class Run:
 
 
 class Method(Protocol):
-    """A way to solve tasks."""
+    """A renderer with its settings."""
 
     name: str
 
@@ -76,7 +79,7 @@ class Method(Protocol):
 
 
 class StaleReference(Exception):
-    """The scene has changed since its reference was made: nothing can be measured against it."""
+    """The scene has changed since its reference was rendered: errors cannot be measured."""
 
 
 def stored_tasks() -> list[str]:
@@ -88,7 +91,7 @@ def load_task(name: str) -> Task:
     """The scene and the reference of a stored picture.
 
     Raises:
-        StaleReference: They do not belong together any more.
+        StaleReference: The scene has changed since its reference was rendered.
     """
     stem, _, _, max_bounces = PICTURES[name]
     stage: Path = ROOT / "scenes_usd" / f"{stem}.usda"
@@ -100,7 +103,7 @@ def load_task(name: str) -> Task:
 
 
 class Ours:
-    """One of our estimators through the public API, as a user would call it."""
+    """One of our estimators, called through the public API."""
 
     def __init__(self, name: str, device: str, **choices: Any) -> None:
         self.name, self.device, self.choices = name, device, choices
@@ -119,13 +122,13 @@ class Ours:
         start = time.perf_counter()
         film = ir.render(self._scene, settings, device=self.device)
         picture = film.radiance()
-        took = time.perf_counter() - start - sum(film.timings.get(step, 0.0) for step in SETUP)
+        duration = time.perf_counter() - start - sum(film.timings.get(step, 0.0) for step in SETUP)
         phases = {name: t for name, t in film.timings.items() if name not in SETUP}
-        return Run(picture, took, film.iterations, phases, film.counts)
+        return Run(picture, duration, film.iterations, phases, film.counts)
 
 
 def own_methods(device: str) -> dict[str, Ours]:
-    """All of our estimators, and `vpl` without its filter and with the denoiser where it has them."""
+    """All of our estimators, and `vpl` also without its filter and, if it is installed, with the denoiser."""
     choices: dict[str, dict[str, Any]] = {name: {"estimator": name} for name in ESTIMATOR_NAMES}
     if "keller" in choices:
         choices["keller"]["light_paths"] = KELLER_PATHS

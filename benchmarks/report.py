@@ -1,4 +1,4 @@
-"""How results are written down: tables on the screen and in Markdown, and what they were measured on."""
+"""Reports: tables on the screen and in Markdown, and a description of the machine and the software."""
 
 import json
 import os
@@ -21,7 +21,7 @@ PACKAGES = ("warp-ir", "warp-lang", "numpy", "mitsuba", "drjit", "pyoidn", "embr
 
 @dataclass(frozen=True)
 class Table:
-    """Text in rows and columns; the first column is the label."""
+    """A table of text; the first column is the label of the row."""
 
     title: str
     columns: tuple[str, ...]
@@ -29,7 +29,7 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """The table as GitHub shows it."""
+        """The table in GitHub's Markdown."""
         lines = [f"### {self.title}", "", *([self.note, ""] if self.note else [])]
         lines += [_line(self.columns), _line(["---", *("---:" for _ in self.columns[1:])])]
         return "\n".join([*lines, *(_line(row) for row in self.rows), ""])
@@ -49,7 +49,7 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def environment(device: str) -> dict[str, Any]:
-    """What a number depends on beside the code: machine, versions, commit, date."""
+    """Machine, versions, commit and date of a measurement."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = {}
     for package in PACKAGES:
@@ -78,7 +78,7 @@ def describe(environment: dict[str, Any]) -> str:
 
 
 def _commit() -> str:
-    """The commit of the working tree, marked if files differ from it."""
+    """The commit of the working tree, with "+changes" if files differ from it."""
     try:
         git = ("git", "-C", str(ROOT))
         commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
@@ -99,7 +99,7 @@ def _processor() -> str:
 def publish(
     tables: list[Table], results: dict[str, Any], *, json_path: Path | None, markdown_path: Path | None
 ) -> None:
-    """Prints the tables and writes what files were asked for."""
+    """Prints the tables and writes the files that are not None."""
     console = Console(width=None if Console().is_terminal else 160)
     for table in tables:
         table.show(console)
@@ -112,5 +112,5 @@ def publish(
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number in few characters; a dash for none."""
+    """A number with few digits; a dash for None."""
     return "–" if value is None else f"{value:.{digits}g}"

@@ -1,10 +1,10 @@
-"""Error against time, at equal time: every scene with a stored reference, every estimator, and other renderers.
+"""Error against time of our estimators and of other renderers, for every scene with a stored reference.
 
     python benchmarks/run.py [-k NAME ...] [--device cpu] [--seconds 0.2 0.6 2] [--seeds 3] [--estimators NAME ...]
                              [--peers] [--json FILE] [--plot FILE.png] [--compare OLD.json] [--quick]
 
-Methods take turns within one run, on the same cores, with everything compiled and uploaded beforehand (those
-seconds are reported apart). Every number is the median over seeds.
+Methods take turns within one run, on the same cores. Compilation and upload happen before and are reported
+separately. Every number is the median over seeds.
 """
 
 import argparse
@@ -22,11 +22,11 @@ from report import Table, environment, number, publish
 
 from warp_ir.metrics import mean_ratio, relative_mse
 
-QUICK = {"names": ["cornell_box", "furnace_cube"], "seconds": [0.1], "seeds": 1}
+QUICK: dict[str, Any] = {"names": ["cornell_box", "furnace_cube"], "seconds": [0.1], "seeds": 1}
 
 
 def measure(task: Task, methods: list[Method], budgets: list[float], seeds: int) -> list[dict[str, Any]]:
-    """Runs all methods in turn, for every seed and budget: what each took and how wrong it was."""
+    """Runs all methods in turn, for every seed and budget, and measures time and error."""
     runs = []
     for seed in range(1, seeds + 1):
         for budget in budgets:
@@ -53,7 +53,7 @@ def measure(task: Task, methods: list[Method], budgets: list[float], seeds: int)
 def measure_all(
     names: list[str], methods: list[Method], budgets: list[float], seeds: int
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, str]]:
-    """The runs of all scenes, the seconds of getting ready, and what was skipped and why."""
+    """The runs of all scenes, the seconds of their preparation, and what was skipped with the reason."""
     runs, setup, skipped = [], [], {}
     for name in names:
         try:
@@ -61,20 +61,20 @@ def measure_all(
         except StaleReference as error:
             skipped[name] = str(error)
             continue
-        able = []
+        prepared = []
         for method in methods:
             try:
                 setup.append({"scene": name, "method": method.name, **method.prepare(task, budgets)})
-                able.append(method)
+                prepared.append(method)
             except NotImplementedError as error:
                 skipped[f"{method.name} on {name}"] = str(error)
-        print(f"{name}: {', '.join(method.name for method in able)}", file=sys.stderr, flush=True)
-        runs += measure(task, able, budgets, seeds)
+        print(f"{name}: {', '.join(method.name for method in prepared)}", file=sys.stderr, flush=True)
+        runs += measure(task, prepared, budgets, seeds)
     return runs, setup, skipped
 
 
 def setup_table(setup: list[dict[str, Any]]) -> Table:
-    """Seconds before the first picture: the worst scene and the median one, by method."""
+    """Compile and upload time of each method: the median over the scenes and the longest."""
     lines = []
     for method in dict.fromkeys(row["method"] for row in setup):
         chosen = [row for row in setup if row["method"] == method]
@@ -83,13 +83,13 @@ def setup_table(setup: list[dict[str, Any]]) -> Table:
             seconds = [row[step] for row in chosen]
             cells += [number(statistics.median(seconds)), number(max(seconds))]
         lines.append((method, *cells))
-    columns = ("method", "compile s, median", "worst", "upload s, median", "worst")
-    note = "Kernels come from the cache if they are in it; the peers' compilation includes their pilot renders."
-    return Table("Before the clock starts", columns, lines, note)
+    columns = ("method", "compile s, median", "longest", "upload s, median", "longest")
+    note = "Kernels may come from the cache; the compile time of the peers includes their probe renders."
+    return Table("Preparation, not part of the measured time", columns, lines, note)
 
 
 def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
-    """Error against seconds on log-log axes, a panel for each scene; bars show the spread of the seeds."""
+    """Plots error against seconds on logarithmic axes, one panel for each scene; bars show the range over the seeds."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -112,12 +112,12 @@ def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
                 (row for row in rows if row["scene"] == scene and row["method"] == method),
                 key=lambda row: row["seconds"],
             )
-            middle = [resolved(row) for row in curve]
-            below = [m - min(resolved(row, "error_low"), m) for m, row in zip(middle, curve, strict=True)]
-            above = [resolved(row, "error_high") - m for m, row in zip(middle, curve, strict=True)]
+            medians = [resolved(row) for row in curve]
+            below = [m - min(resolved(row, "error_low"), m) for m, row in zip(medians, curve, strict=True)]
+            above = [resolved(row, "error_high") - m for m, row in zip(medians, curve, strict=True)]
             style = "--" if method.startswith("mitsuba") else "-"
             seconds = [row["seconds"] for row in curve]
-            panel.errorbar(seconds, middle, [below, above], fmt=f"o{style}", color=f"C{k}", label=method, ms=3)
+            panel.errorbar(seconds, medians, [below, above], fmt=f"o{style}", color=f"C{k}", label=method, ms=3)
         floor = next(row["floor"] for row in rows if row["scene"] == scene)
         panel.axhline(floor, color="0.7", lw=0.8, ls=":")
         panel.set(xscale="log", yscale="log", title=scene, xlabel="seconds", ylabel="relMSE")
@@ -133,19 +133,26 @@ def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The command line, its names checked and its defaults filled in."""
+    """Parses the command line, checks its names and fills in the defaults."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("-k", dest="names", nargs="+", metavar="NAME", help="scenes; all with a reference by default")
+    parser.add_argument("-k", dest="names", nargs="+", metavar="NAME", help="scenes (default: all with a reference)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda:N")
-    parser.add_argument("--seconds", type=float, nargs="+", help="time budgets; 0.2, 0.6 and 2 by default")
-    parser.add_argument("--seeds", type=int, help="repetitions; 3 by default")
-    parser.add_argument("--estimators", nargs="+", metavar="NAME", help="ours to run; all by default")
-    parser.add_argument("--peers", action="store_true", help="measure the other renderers that are installed")
+    parser.add_argument("--seconds", type=float, nargs="+", help="time budgets (default: 0.2 0.6 2)")
+    parser.add_argument("--seeds", type=int, help="number of seeds (default: 3)")
+    parser.add_argument("--estimators", nargs="+", metavar="NAME", help="our methods to run (default: all)")
+    parser.add_argument("--peers", action="store_true", help="also measure other renderers that are installed")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw error against time")
-    parser.add_argument("--compare", type=Path, metavar="OLD.json", help="fail if time x error is worse than there")
-    parser.add_argument("--quick", action="store_true", help="two scenes, 0.1 s, one seed: does it run?")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="plot error against time")
+    parser.add_argument(
+        "--compare",
+        type=Path,
+        metavar="OLD.json",
+        help="compare with this result; exit code 1 if time x error has grown",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="two scenes, 0.1 s, one seed: to check that the program runs"
+    )
     options = parser.parse_args(arguments)
     defaults = QUICK if options.quick else {"names": stored_tasks(), "seconds": [0.2, 0.6, 2.0], "seeds": 3}
     for name, value in defaults.items():
@@ -161,14 +168,14 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measures and reports; 1 if something is worse than in the result to compare with."""
+    """Measures and reports; returns 1 if a result is worse than the earlier one."""
     options = parse(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    peers, absent = find_peers(options.device) if options.peers else ({}, {})
+    peers, missing = find_peers(options.device) if options.peers else ({}, {})
     methods = [*options.own, *peers.values()]
     runs, setup, skipped = measure_all(options.names, methods, options.seconds, options.seeds)
-    for what, why in {**absent, **skipped}.items():
-        print(f"skipped {what}: {why}", file=sys.stderr)
+    for name, reason in {**missing, **skipped}.items():
+        print(f"skipped {name}: {reason}", file=sys.stderr)
     if not runs:
         return 1
     rows = summarize(runs)
@@ -177,7 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
         "settings": {method.name: method.choices for method in options.own},
         "seconds": options.seconds,
         "seeds": options.seeds,
-        "skipped": {**absent, **skipped},
+        "skipped": {**missing, **skipped},
         "rows": rows,
         "setup": setup,
         "runs": runs,
@@ -193,8 +200,8 @@ def main(arguments: list[str] | None = None) -> int:
         old = json.loads(options.compare.read_text())
         table, worse = compare(rows, old.get("error", old)["rows"])
         tables.append(table)
-    shown = [table for table in tables if table is not None]
-    publish(shown, results, json_path=options.json, markdown_path=options.markdown)
+    present = [table for table in tables if table is not None]
+    publish(present, results, json_path=options.json, markdown_path=options.markdown)
     if options.plot is not None:
         plot(rows, options.plot, f"{results['environment']['device_name']}, {results['environment']['commit']}")
     return int(worse)

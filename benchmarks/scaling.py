@@ -1,10 +1,10 @@
-"""How the cost grows with pixels, triangles, light paths, lights and threads: ratios within one run, and memory.
+"""Growth of time and memory with the numbers of pixels, triangles, light paths, lights and threads.
 
     python benchmarks/scaling.py [--device cpu] [--estimators NAME ...] [--quick] [--json FILE] [--markdown FILE]
 
-One thing is changed at a time in a procedural scene: a lit box with a wrinkled ball, of as many triangles as
-wanted. The time is that of one iteration, the least of several, the sizes of a question taking turns; getting ready
-is reported beside it.
+One number is changed at a time in a procedural scene: a lit box with a wrinkled ball of any number of triangles. The
+time is that of one iteration: the shortest of several, with all values of a question taking turns. The upload time is
+reported as well.
 """
 
 import argparse
@@ -29,23 +29,23 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.renderer import Renderer
 
 SIZE = 10.0
-"""Of the room."""
+"""Edge of the room in scene units."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """What one number of the scene or the settings costs."""
+    """The cost of one number of the scene or the settings."""
 
     name: str
     values: tuple[int, ...]
     base: int
-    """The value that the others are compared with."""
-    wanted: float
-    """Time at the last value over the time at `base`, at most."""
+    """The value with which the others are compared."""
+    goal: float
+    """Upper limit of the time at the last value divided by the time at `base`."""
 
     def make(self, value: int, width: int) -> tuple[ir.Scene, dict[str, Any], int | None]:
-        """Scene, settings and threads with this one thing set."""
-        settings = {"width": width}
+        """Scene, settings and CPU threads (None: all) for one value."""
+        settings: dict[str, Any] = {"width": width}
         match self.name:
             case "pixels":
                 return room(), {"width": math.isqrt(value)}, None
@@ -59,20 +59,20 @@ class Question:
 
 
 def questions(quick: bool, cores: int) -> list[Question]:
-    """All of them, with what is wanted."""
+    """All questions with their goals."""
     if quick:
         return [Question("pixels", (32**2, 64**2), 32**2, 4.4), Question("lights", (1, 100), 1, 2.0)]
-    found = [
+    all_questions = [
         Question("pixels", (64**2, 128**2, 256**2, 512**2), 128**2, 16 * 1.1),
         Question("triangles", (1_000, 10_000, 100_000, 1_000_000), 10_000, 3.0),
         Question("light paths", (256, 1024, 4096), 256, 2.0),
         Question("lights", (1, 100, 10_000), 1, 2.0),
     ]
-    return [*found, Question("threads", (1, 2), 1, 1 / 1.8)] if cores > 1 else found
+    return [*all_questions, Question("threads", (1, 2), 1, 1 / 1.8)] if cores > 1 else all_questions
 
 
 def ball(triangles: int) -> ir.Mesh:
-    """A wrinkled ball of about that many triangles: a grid over the sphere, moved in and out by waves."""
+    """A wrinkled ball of about that many triangles: a grid over the sphere, displaced by sine waves."""
     rows = max(4, int(np.sqrt(triangles / 4.0)))
     columns = 2 * rows
     theta, phi = np.meshgrid(
@@ -88,16 +88,16 @@ def ball(triangles: int) -> ir.Mesh:
 
 
 def room(*, triangles: int = 10_000, lights: int = 1) -> ir.Scene:
-    """The ball in a box, under a grid of lamps that together are as bright as one."""
+    """The ball in a box, under a grid of lamps whose total power does not depend on their number."""
     walls, indices = procedural.cube(SIZE, inward=True)
     side = int(np.ceil(np.sqrt(lights)))
     lamps = []
     for k in range(lights):
         world = np.eye(4)
-        # A RECT emits along its own -Z: turned to shine down.
+        # A RECT light emits along its own -Z: it is rotated to emit downwards.
         world[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-        place = (np.array([k % side, k // side]) + 0.5) / side - 0.5
-        world[:3, 3] = [0.8 * SIZE * place[0], 0.49 * SIZE, 0.8 * SIZE * place[1]]
+        x, z = (np.array([k % side, k // side]) + 0.5) / side - 0.5
+        world[:3, 3] = [0.8 * SIZE * x, 0.49 * SIZE, 0.8 * SIZE * z]
         edge = 0.3 * SIZE / side
         radiance = 10.0 * side * side / lights
         lamps.append(ir.Light(f"lamp {k}", ir.LightKind.RECT, (radiance,) * 3, world, width=edge, height=edge))
@@ -111,7 +111,10 @@ def room(*, triangles: int = 10_000, lights: int = 1) -> ir.Scene:
 
 
 def iteration_seconds(renderers: dict[int, Renderer], seconds: float) -> dict[int, float]:
-    """The least time of an iteration of each, taking turns for as long as `seconds` each, and three times at least."""
+    """The shortest time of an iteration of each renderer.
+
+    The renderers take turns for `seconds` each, at least three times after a warm-up.
+    """
     films = {value: renderer.new_film() for value, renderer in renderers.items()}
     times: dict[int, list[float]] = {value: [] for value in renderers}
     spent = 0.0
@@ -121,13 +124,13 @@ def iteration_seconds(renderers: dict[int, Renderer], seconds: float) -> dict[in
             renderer.add_iteration(films[value], films[value].iterations)
             times[value].append(time.perf_counter() - start)
             spent += times[value][-1]
-    return {value: min(taken[1:]) for value, taken in times.items()}
+    return {value: min(durations[1:]) for value, durations in times.items()}
 
 
-def used_memory(device: Any) -> int:
-    """Bytes that this process holds now: on the GPU, or resident."""
+def used_memory(device: wp.Device) -> int:
+    """Memory in use [bytes]: that of the GPU, or the resident memory of this process."""
     gc.collect()
-    if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps what is freed, unless asked
+    if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps freed memory unless told to return it
         ctypes.CDLL(None).malloc_trim(0)
     if device.is_cuda:
         wp.synchronize_device(device)
@@ -139,34 +142,34 @@ def used_memory(device: Any) -> int:
 
 
 def memory(device: str, estimator: dict[str, Any], quick: bool) -> dict[str, float]:
-    """Bytes per triangle and per pixel by which the process grows: from a small scene or picture to a large one."""
-    opened = wp.get_device(device)
+    """Growth of the process in bytes per triangle and per pixel, from a small scene or picture to a large one."""
+    warp_device = wp.get_device(device)
     many, few = (100_000, 1_000) if quick else (1_000_000, 1_000)
     wide, narrow = (512, 64) if quick else (1024, 64)
     scenes = {count: room(triangles=count) for count in (few, many)}
 
-    def growth(triangles: int, width: int) -> int:
-        before = used_memory(opened)
+    def growth_of(triangles: int, width: int) -> int:
+        before = used_memory(warp_device)
         renderer = Renderer(scenes[triangles], ir.RenderSettings(width=width, **estimator), device=device)
         film = renderer.new_film()
         renderer.add_iteration(film, 0)
         renderer.add_iteration(film, 1)
         picture = film.radiance()
-        held = used_memory(opened) - before
+        growth = used_memory(warp_device) - before
         del renderer, film, picture
-        return held
+        return growth
 
-    growth(few, narrow)  # what is allocated once, is allocated now
-    base = growth(few, narrow)
+    growth_of(few, narrow)  # allocates what is allocated only once
+    base = growth_of(few, narrow)
     triangles = scenes[many].triangle_count - scenes[few].triangle_count
     return {
-        "bytes_per_triangle": (growth(many, narrow) - base) / triangles,
-        "bytes_per_pixel": (growth(few, wide) - base) / (wide**2 - narrow**2),
+        "bytes_per_triangle": (growth_of(many, narrow) - base) / triangles,
+        "bytes_per_pixel": (growth_of(few, wide) - base) / (wide**2 - narrow**2),
     }
 
 
 def measure(device: str, name: str, estimator: dict[str, Any], quick: bool) -> list[dict[str, Any]]:
-    """The time of an iteration, and of the upload, for every value of every question."""
+    """Measures the time of an iteration and of the upload for every value of every question."""
     width = 32 if quick else 128
     rows = []
     for question in questions(quick, Launcher(device).threads):
@@ -185,7 +188,7 @@ def measure(device: str, name: str, estimator: dict[str, Any], quick: bool) -> l
                     "value": value,
                     "seconds": seconds[value],
                     "ratio": seconds[value] / seconds[question.base],
-                    "wanted": question.wanted if value == question.values[-1] else None,
+                    "wanted": question.goal if value == question.values[-1] else None,
                     "upload": renderer.launcher.profile.seconds()["upload"],
                 }
             )
@@ -193,7 +196,7 @@ def measure(device: str, name: str, estimator: dict[str, Any], quick: bool) -> l
 
 
 def frame_rate(device: str, estimator: dict[str, Any], quick: bool) -> dict[str, float]:
-    """Iterations per second of a 1080p picture of 100 000 triangles (`quick`: of a small one of few)."""
+    """Iterations per second of a 1080p picture of 100 000 triangles (`quick`: of a small picture of 1 000)."""
     width, height, triangles = (64, 36, 1_000) if quick else (1920, 1080, 100_000)
     settings = ir.RenderSettings(**{**estimator, "width": width, "height": height})
     renderer = Renderer(room(triangles=triangles), settings, device=device)
@@ -204,43 +207,45 @@ def frame_rate(device: str, estimator: dict[str, Any], quick: bool) -> dict[str,
 def tables(
     rows: list[dict[str, Any]], memories: dict[str, dict[str, float]], frames: dict[str, dict[str, float]]
 ) -> list[Table]:
-    """Cost relative to the base value of each question, memory, and the rate at full size."""
+    """Tables of the time relative to the base value of each question, of memory, and of the rate at full size."""
     lines = []
     for row in rows:
-        wanted, reached = "", ""
+        goal, reached = "", ""
         if row["wanted"] is not None:
-            wanted, reached = f"< {row['wanted']:.3g}", "yes" if row["ratio"] < row["wanted"] else "no"
+            goal, reached = f"< {row['wanted']:.3g}", "yes" if row["ratio"] < row["wanted"] else "no"
         times = (number(1e3 * row["seconds"]), number(row["ratio"]))
-        cells = (f"{row['value']:,}", *times, wanted, reached, number(row["upload"]))
+        cells = (f"{row['value']:,}", *times, goal, reached, number(row["upload"]))
         lines.append((row["question"], row["estimator"], *cells))
-    columns = ("question", "estimator", "value", "ms per iteration", "× time", "wanted", "reached", "upload s")
-    held = [
-        (name, number(found["bytes_per_triangle"]), "< 200", number(found["bytes_per_pixel"]), "< 300")
-        for name, found in memories.items()
+    columns = ("question", "estimator", "value", "ms per iteration", "× time", "goal", "reached", "upload s")
+    growths = [
+        (name, number(growth["bytes_per_triangle"]), "< 200", number(growth["bytes_per_pixel"]), "< 300")
+        for name, growth in memories.items()
     ]
-    heads = ("estimator", "bytes per triangle", "wanted", "bytes per pixel", "wanted")
-    note = "What the process grows by, the scene's own arrays on the host not counted."
+    heads = ("estimator", "bytes per triangle", "goal", "bytes per pixel", "goal")
+    note = "Growth of the process without the scene's own arrays on the host."
     rates = [
         (
             name,
-            f"{found['width']} × {found['height']}",
-            f"{found['triangles']:,}",
-            number(found["iterations_per_second"]),
+            f"{rate['width']} × {rate['height']}",
+            f"{rate['triangles']:,}",
+            number(rate["iterations_per_second"]),
         )
-        for name, found in frames.items()
+        for name, rate in frames.items()
     ]
-    frame = Table("Full size", ("estimator", "pixels", "triangles", "iterations per second"), rates)
-    return [Table("Cost against size", columns, lines), Table("Memory", heads, held, note), frame]
+    full_size = Table("Full size", ("estimator", "pixels", "triangles", "iterations per second"), rates)
+    return [Table("Cost against size", columns, lines), Table("Memory", heads, growths, note), full_size]
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measures and reports."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="cpu", help="cpu or cuda:N")
-    parser.add_argument("--estimators", nargs="+", metavar="NAME", help="the default one and path by default")
+    parser.add_argument(
+        "--estimators", nargs="+", metavar="NAME", help="estimators to measure (default: the default one and path)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables")
-    parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--quick", action="store_true", help="small sizes, to check that the program runs")
     options = parser.parse_args(arguments)
     known = own_methods(options.device)
     names = options.estimators or list(dict.fromkeys((ir.RenderSettings().estimator, "path")))

@@ -1,6 +1,6 @@
-"""Scenes of which the camera sees a small part, and what is gained there by light paths that know it.
+"""Gain of path guiding in scenes of which the camera sees only a small part.
 
-As a program: variance of one iteration and CPU time of each, with the pilot and without it.
+The program prints the variance of one iteration and its CPU time, with and without guiding.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import warp_ir as ir
 import warp_ir.estimators.vpl
 from warp_ir.procedural import cube, mesh, quad
 from warp_ir.renderer import Renderer
-from warp_ir.scene import Camera, Light, LightKind, Material, Mesh, Scene
+from warp_ir.scene import Camera, Floats, Light, LightKind, Material, Mesh, Scene
 from warp_ir.vpl.guide import unguided
 
 _WHITE, _RED, _LAMP, _GROUND = range(4)
@@ -34,7 +34,7 @@ def _box(name: str, low: Sequence[float], high: Sequence[float], material: int =
 
 
 def _wall(name: str, begin: Sequence[float], end: Sequence[float], gap: Sequence[float] | None) -> list[Mesh]:
-    """A wall 3 high along X or Y with an opening: begin and end of it along the wall, bottom and top."""
+    """A wall of height 3 along X or Y; `gap` is its opening: begin and end along the wall, bottom and top."""
     b, e = np.array([*begin, 0.0]), np.array([*end, 3.0])
     axis = int(e[1] - b[1] > e[0] - b[0])
     if gap is None:
@@ -56,7 +56,7 @@ def _wall(name: str, begin: Sequence[float], end: Sequence[float], gap: Sequence
 
 
 def rooms(count: int = 10) -> Scene:
-    """A storey of `count` x `count` rooms of 4 m with doors, a lamp in each; the camera is in one of them."""
+    """A storey of `count` x `count` rooms of 4 m with doors and a lamp in each; the camera is in one of them."""
     size, thick = 4.0, 0.1
     meshes = [
         _box("floor", (-1, -1, -0.1), (count * size + 1, count * size + 1, 0.0)),
@@ -85,7 +85,7 @@ def rooms(count: int = 10) -> Scene:
 
 
 def terrain(size: float = 1000.0, cells: int = 128) -> Scene:
-    """Hills under sun and sky; the camera looks at blocks on ten metres of them."""
+    """Hills of 1 km under sun and sky; the camera sees blocks on ten metres of them."""
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, cells + 1) * size, np.linspace(-0.5, 0.5, cells + 1) * size)
     z = 20.0 * np.sin(x * 0.021) * np.cos(y * 0.017) + 6.0 * np.sin(x * 0.06 + 1.0) * np.sin(y * 0.05)
     z = (z - z[cells // 2, cells // 2]) * (1.0 - np.exp(-(x**2 + y**2) / 40.0**2))
@@ -102,14 +102,14 @@ def terrain(size: float = 1000.0, cells: int = 128) -> Scene:
     ]
     tilt, turn = np.radians(50.0), np.radians(200.0)
     back = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-    sun = Light("sun", LightKind.DISTANT, (40000.0, 36000.0, 30000.0), world_from_light=_along(back))
+    sun = Light("sun", LightKind.DISTANT, (40000.0, 36000.0, 30000.0), world_from_light=_world_from_light(back))
     sky = Light("sky", LightKind.DOME, (0.35, 0.5, 0.9))
     camera = Camera.look_at((0.0, -9.0, 3.5), (0.0, 2.0, 1.0), up=(0, 0, 1), fov=45.0)
     return Scene((ground, *blocks), _MATERIALS, lights=(sun, sky), camera=camera, name="terrain")
 
 
 def house() -> Scene:
-    """A house of nine rooms in a field; sun and sky enter the one with the camera by a single window."""
+    """A house of nine rooms in a field; sun and sky light the room of the camera through a single window."""
     meshes = [
         _box("field", (-30, -30, -0.1), (42, 42, 0.0), _GROUND),
         _box("roof", (-0.2, -0.2, 3.0), (12.2, 12.2, 3.2)),
@@ -125,14 +125,14 @@ def house() -> Scene:
     meshes.append(_box("table", (2.4, 6.6, 0.0), (3.6, 7.6, 0.8), _RED))
     tilt, turn = np.radians(35.0), np.radians(170.0)
     back = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-    sun = Light("sun", LightKind.DISTANT, (40000.0, 36000.0, 30000.0), world_from_light=_along(back))
+    sun = Light("sun", LightKind.DISTANT, (40000.0, 36000.0, 30000.0), world_from_light=_world_from_light(back))
     sky = Light("sky", LightKind.DOME, (0.35, 0.5, 0.9))
     camera = Camera.look_at((0.5, 4.5, 1.7), (3.2, 6.9, 0.9), up=(0, 0, 1), fov=75.0)
     return Scene(tuple(meshes), _MATERIALS, lights=(sun, sky), camera=camera, name="house")
 
 
-def _along(back: np.ndarray) -> np.ndarray:
-    """A light that comes from a unit direction."""
+def _world_from_light(back: Floats) -> Floats:
+    """The transform [4, 4] of a distant light that comes from a unit direction."""
     x = np.cross([0.0, 0.0, 1.0], back)
     x /= np.linalg.norm(x)
     out = np.eye(4)
@@ -141,7 +141,7 @@ def _along(back: np.ndarray) -> np.ndarray:
 
 
 def measure(scene: Scene, width: int, iterations: int, *, guided: bool) -> tuple[float, float, float]:
-    """Relative variance of an iteration and of its mean, and seconds of CPU time of one; the pilot is part of them."""
+    """Relative variance of an iteration per pixel and of its mean, and CPU time [s] per iteration with guiding."""
     settings = ir.RenderSettings(width=width, height=width, filter=False)
     learn = warp_ir.estimators.vpl.learn
     if not guided:
@@ -160,21 +160,23 @@ def measure(scene: Scene, width: int, iterations: int, *, guided: bool) -> tuple
 
 
 def main() -> None:
-    """Prints a table."""
+    """Measures the scenes and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-k", metavar="NAME", nargs="+", help="only these scenes")
+    parser.add_argument("-k", metavar="NAME", nargs="+", help="scenes to measure (default: all)")
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--iterations", type=int, default=16)
     args = parser.parse_args()
     scenes = {"rooms": rooms, "terrain": terrain, "house": house}
-    print("| scene | variance | of the mean | s | with pilot | of the mean | s | gain in variance x time |")
+    print("| scene | variance | of the mean | s | with guiding | of the mean | s | gain in variance x time |")
     print("|---|---|---|---|---|---|---|---|")
     for name in args.k or [*scenes, *stored_tasks()]:
         scene = scenes[name]() if name in scenes else load_task(name).scene
-        measure(scene, 32, 2, guided=True)  # compiled
-        before, after = (measure(scene, args.width, args.iterations, guided=guided) for guided in (False, True))
-        gain = before[0] * before[2] / (after[0] * after[2])
-        cells = [f"{x:.3g}" for x in (*before, *after)]
+        measure(scene, 32, 2, guided=True)  # compiles the kernels
+        unguided_cost, guided_cost = (
+            measure(scene, args.width, args.iterations, guided=guided) for guided in (False, True)
+        )
+        gain = unguided_cost[0] * unguided_cost[2] / (guided_cost[0] * guided_cost[2])
+        cells = [f"{x:.3g}" for x in (*unguided_cost, *guided_cost)]
         print(f"| {name} | {' | '.join(cells)} | {gain:.2f} |", flush=True)
 
 

@@ -1,10 +1,10 @@
-"""Prints a hash of the pixels of some twenty small renders: over all estimators, filters and kinds of scene.
+"""Prints a hash of the pixels of each of some thirty small renders of all estimators, filters and types of scenes.
 
-A change that is not meant to change pictures leaves every hash as it was. Hashes are only comparable on one machine and
-one device: compilers for other processors round differently.
+A change that must not affect pictures must not change a hash. Hashes are only comparable on one machine and one device:
+compilers for other processors round differently.
 
-python scripts/hash_pictures.py --write before.json     # before the change
-python scripts/hash_pictures.py --compare before.json   # after it; exit code 1 if a picture has changed
+    python scripts/hash_pictures.py --write before.json     # before the change
+    python scripts/hash_pictures.py --compare before.json   # after it; exit code 1 if a picture has changed
 """
 
 import argparse
@@ -16,20 +16,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 import warp_ir as ir
 
 SCENES = Path(__file__).parent.parent / "scenes_usd"
 AOVS = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 
-Render = Callable[[str], list[np.ndarray]]
-"""From a device's name to all arrays of a picture."""
+Arrays = list[npt.NDArray[np.generic]]
+Render = Callable[[str], Arrays]
+"""Renders a picture on the device of a name and returns all its arrays."""
 
 
 def film_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
-    """Renders a scene and returns its radiance, standard error and AOVs."""
+    """A function that renders a scene and returns its radiance, standard error and AOVs."""
 
-    def render(device: str) -> list[np.ndarray]:
+    def render(device: str) -> Arrays:
         film = ir.render(scene(), ir.RenderSettings(**settings), device=device)
         return [film.radiance(), film.standard_error(), *(film.aov(name) for name in AOVS)]
 
@@ -37,9 +39,9 @@ def film_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
 
 
 def vpls_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
-    """Traces the VPLs of a scene."""
+    """A function that traces the VPLs of a scene and returns their arrays."""
 
-    def trace(device: str) -> list[np.ndarray]:
+    def trace(device: str) -> Arrays:
         vpls = ir.trace_vpls(scene(), ir.RenderSettings(**settings), device=device)
         return [vpls.positions, vpls.normals, vpls.intensity, vpls.bounce]
 
@@ -47,7 +49,7 @@ def vpls_of(scene: Callable[[], ir.Scene], **settings: object) -> Render:
 
 
 def stage(name: str, **camera: object) -> Callable[[], ir.Scene]:
-    """Reads a test scene; `camera` replaces fields of its camera."""
+    """A function that reads a test scene; `camera` replaces fields of its camera."""
 
     def load() -> ir.Scene:
         scene = ir.load_usd(SCENES / f"{name}.usda")
@@ -56,14 +58,13 @@ def stage(name: str, **camera: object) -> Callable[[], ir.Scene]:
     return load
 
 
-def blurred() -> ir.Scene:
-    """The turntable with an open shutter."""
-    reader = ir.StageReader(SCENES / "turntable.usda")
-    return reader.read(4.0)
+def turntable() -> ir.Scene:
+    """Reads the turntable at frame 4."""
+    return ir.StageReader(SCENES / "turntable.usda").read(4.0)
 
 
 def renders() -> Iterator[tuple[str, Render]]:
-    """The name of each picture, and how it is made."""
+    """The name of each picture and the function that renders it."""
     small = {"width": 64, "iterations": 6}
     yield "cornell_box vpl", film_of(stage("cornell_box"), **small)
     yield "cornell_box vpl plain", film_of(stage("cornell_box"), filter=False, **small)
@@ -85,8 +86,8 @@ def renders() -> Iterator[tuple[str, Render]]:
         yield f"{name} path", film_of(stage(name), estimator="path", visible_lights=True, width=48, iterations=2)
     for name in ("furnace_sphere", "furnace_cube"):
         yield f"{name} vpl", film_of(stage(name), width=32, iterations=4)
-    yield "turntable blurred vpl", film_of(blurred, **small)
-    yield "turntable blurred path", film_of(blurred, estimator="path", width=48, iterations=2)
+    yield "turntable blurred vpl", film_of(turntable, **small)
+    yield "turntable blurred path", film_of(turntable, estimator="path", width=48, iterations=2)
     for name in ("cornell_box", "light_types", "two_rooms"):
         yield f"{name} vpls", vpls_of(stage(name))
 
@@ -95,11 +96,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Hash the pixels of some small renders.")
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the hashes as JSON")
-    parser.add_argument("--compare", type=Path, metavar="FILE", help="hashes to compare with")
-    parser.add_argument("-k", dest="name", default="", metavar="TEXT", help="only pictures with this in their name")
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="compare with the hashes in this file")
+    parser.add_argument("-k", dest="name", default="", metavar="TEXT", help="only pictures whose name contains this")
     args = parser.parse_args()
 
-    before = json.loads(args.compare.read_text()) if args.compare else {}
+    earlier = json.loads(args.compare.read_text()) if args.compare else {}
     hashes, changed = {}, []
     for name, render in renders():
         if args.name not in name:
@@ -107,7 +108,7 @@ def main() -> None:
         hashes[name] = hashlib.sha256(
             b"".join(np.ascontiguousarray(a).tobytes() for a in render(args.device))
         ).hexdigest()[:16]
-        differs = before.get(name, hashes[name]) != hashes[name]
+        differs = earlier.get(name, hashes[name]) != hashes[name]
         changed += [name] * differs
         print(f"{hashes[name]}  {name}{'  CHANGED' if differs else ''}", flush=True)
     if args.write:

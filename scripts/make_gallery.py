@@ -1,4 +1,4 @@
-"""Makes the pictures of the README again.
+"""Renders the pictures of the README.
 
 python scripts/make_gallery.py docs --device cpu
 """
@@ -18,20 +18,22 @@ PICTURES = {
     "light_types.jpg": {"iterations": 128, "visible_lights": True},
     "thousand_lights.jpg": {"iterations": 64, "visible_lights": True},
 }
-"""File name, whose stem is the scene's, and what is set for it."""
+"""File name, whose stem is the name of the scene, and its render settings."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Make the pictures of the README.")
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where to write them")
+    parser = argparse.ArgumentParser(description="Render the pictures of the README.")
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder to write to")
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
-    parser.add_argument("-k", dest="name", default="", metavar="TEXT", help="only files with this in their name")
+    parser.add_argument("-k", dest="name", default="", metavar="TEXT", help="only files whose name contains this")
     args = parser.parse_args()
 
-    for name, chosen in PICTURES.items():
+    for name, choices in PICTURES.items():
         if args.name in name:
             path = args.folder / name
-            film = ir.render(ir.load_usd(SCENES / f"{path.stem}.usda"), ir.RenderSettings(**chosen), device=args.device)
+            film = ir.render(
+                ir.load_usd(SCENES / f"{path.stem}.usda"), ir.RenderSettings(**choices), device=args.device
+            )
             if film.interrupted:
                 sys.exit("interrupted")
             ir.write_image(path, film)

@@ -1,11 +1,11 @@
-"""Write the test scenes of `scenes_usd/`: USD text, three small textures, and the README table.
+"""Writes the test scenes in `scenes_usd/`: USD text, three small textures, and the README with its table.
 
     python scripts/make_scenes.py [FOLDER]
 
-The same script writes the same bytes every time: numbers are rounded, and all randomness comes from
-one fixed stream. Each scene is one function below that fills a `Builder`; its docstring is the
-documentation of the layer. Surfaces are purely diffuse (specular workflow with a black specular) and
-faceted, so that any renderer that reads UsdPreviewSurface sees the same scene. Licence of the scenes: CC0.
+The output is deterministic to the byte: numbers are rounded, and seeds are fixed. Each scene is a function
+that fills a `Builder`; its docstring becomes the documentation of the layer. Surfaces are purely diffuse (specular
+workflow with black specular colour) and faceted, so that all renderers that read UsdPreviewSurface render the same
+scene. The licence of the scenes is CC0.
 """
 
 import argparse
@@ -136,12 +136,12 @@ def crowded_room():
         scene.stage.DefinePrim(f"/World/Prototypes/{name}", "Xform")
         scene.mesh(f"Prototypes/{name}/Shape", points, faces, digits=3)
 
-    def instance(group, name, *placing):
+    def instance(group, name, *transform):
         count = len(scene.stage.DefinePrim(f"/World/{group}", "Scope").GetChildren())
         prim = UsdGeom.Xform.Define(scene.stage, f"/World/{group}/{name}_{count}").GetPrim()
         prim.GetReferences().AddInternalReference(f"/World/Prototypes/{name}")
         prim.SetInstanceable(True)
-        scene.place(prim, *placing)
+        scene.place(prim, *transform)
         scene.bind(prim, palette[int(9 * stream.random())])
 
     names = ("boulder", "vase", "knot", "chair")
@@ -363,9 +363,9 @@ SCENES = {
 README = """\
 # Test scenes
 
-Written by `scripts/make_scenes.py`: change them there. Each has a camera `main_cam`, and says more about itself in
-its layer's `doc`. References are the pictures in `benchmarks/references/`. Everything here, textures included, is
-dedicated to the public domain ([CC0 1.0](https://creativecommons.org/publicdomain/zero/1.0/)).
+`scripts/make_scenes.py` writes these files: change them there. Each scene has a camera `main_cam`, and the `doc` of its
+layer describes it in more detail. References are the pictures in `benchmarks/references/`. All files in this folder,
+including the textures, are dedicated to the public domain ([CC0 1.0](https://creativecommons.org/publicdomain/zero/1.0/)).
 
 | file | what it shows | known answer | triangles | lights | licence |
 |---|---|---|---:|---:|---|
@@ -373,7 +373,7 @@ dedicated to the public domain ([CC0 1.0](https://creativecommons.org/publicdoma
 
 
 def _count(stage):
-    """Triangles and lights, instances counted as often as they appear."""
+    """The numbers of triangles and lights, with all instances."""
     triangles = lights = 0
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.Mesh):
@@ -383,7 +383,7 @@ def _count(stage):
 
 
 def write_scenes(folder):
-    """Write every scene, the textures and README.md into `folder`."""
+    """Writes every scene, the textures and README.md into `folder`."""
     folder = Path(folder)
     (folder / "textures").mkdir(parents=True, exist_ok=True)
     for name, make in TEXTURES.items():
@@ -396,13 +396,14 @@ def write_scenes(folder):
     for make, answer in SCENES.items():
         scene = make()
         scene.stage.GetRootLayer().Export(str(folder / f"{make.__name__}.usda"))
-        shows = make.__doc__.strip().split("\n")[0]
+        summary = make.__doc__.strip().split("\n")[0]
         triangles, lights = _count(scene.stage)
-        rows.append(f"| `{make.__name__}.usda` | {shows} | {answer} | {triangles:,} | {lights} | CC0 |")
+        rows.append(f"| `{make.__name__}.usda` | {summary} | {answer} | {triangles:,} | {lights} | CC0 |")
     (folder / "README.md").write_text(README + "\n".join(rows) + "\n", encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", nargs="?", default=Path(__file__).parents[1] / "scenes_usd")
+    default = Path(__file__).parents[1] / "scenes_usd"
+    parser.add_argument("folder", metavar="FOLDER", nargs="?", default=default, help="folder to write to")
     write_scenes(parser.parse_args().folder)

@@ -1,4 +1,4 @@
-"""Renders a USD stage to a picture: the Python API in one page.
+"""Renders a USD stage to a picture: a short example of the Python API.
 
 python scripts/render_usd.py scenes_usd/cornell_box.usda cornell_box.exr --device cpu --time-limit 20
 """
@@ -14,10 +14,10 @@ def main() -> None:
     parser.add_argument("stage", metavar="STAGE", help="USD file")
     parser.add_argument("output", metavar="OUTPUT", help=".exr .hdr .pfm .npy (linear), .png .jpg (tone-mapped)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
-    parser.add_argument("--camera", help="path or name (default: the stage's main camera)")
-    parser.add_argument("--width", type=int, default=512, help="pixels (default: 512)")
-    parser.add_argument("--iterations", type=int, help="stop after so many (default: 64 without a time limit)")
-    parser.add_argument("--time-limit", type=float, help="stop after so many seconds")
+    parser.add_argument("--camera", help="path or name of the camera (default: the stage's main camera)")
+    parser.add_argument("--width", type=int, default=512, help="width in pixels (default: 512)")
+    parser.add_argument("--iterations", type=int, help="stop after this number (default: 64 without a time limit)")
+    parser.add_argument("--time-limit", type=float, help="stop after this number of seconds")
     args = parser.parse_args()
 
     scene = ir.load_usd(args.stage, camera=args.camera)

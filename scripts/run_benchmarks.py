@@ -1,9 +1,9 @@
-"""Run all benchmarks on one device or several, and write tables, plots and numbers to `benchmarks/results/`.
+"""Runs `run.py`, `rays.py` and `scaling.py` on one or more devices; the results go to `benchmarks/results/`.
 
     python scripts/run_benchmarks.py --device cpu [--device cuda:0] [--quick]
 
 For each device: `<device>.json` (all numbers), `<device>.md` (the tables) and `<device>.png` (error against time).
-Leave the machine alone meanwhile.
+Run nothing else on the machine meanwhile.
 """
 
 import argparse
@@ -18,7 +18,7 @@ QUESTIONS = {"error": "run.py", "rays": "rays.py", "scaling": "scaling.py"}
 
 
 def run(device: str, results: Path, quick: bool) -> None:
-    """All questions on one device, each in a process of its own."""
+    """Runs all questions on one device, each in a separate process."""
     stem = results / device.replace(":", "")
     numbers, tables = {}, [f"# Benchmarks on {device}\n\n![error against time]({stem.name}.png)\n"]
     with tempfile.TemporaryDirectory() as scratch:
@@ -40,9 +40,13 @@ def run(device: str, results: Path, quick: bool) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--device", dest="devices", action="append", help="cpu, cuda:0, ...; may be repeated")
+    parser.add_argument(
+        "--device", dest="devices", action="append", help="cpu, cuda:0, ...; may be repeated (default: cpu)"
+    )
     parser.add_argument("--results", type=Path, default=BENCHMARKS / "results", help="folder to write to")
-    parser.add_argument("--quick", action="store_true", help="a minute instead of a quarter of an hour; no peers")
+    parser.add_argument(
+        "--quick", action="store_true", help="short runs without peers: a minute instead of a quarter of an hour"
+    )
     options = parser.parse_args()
     options.results.mkdir(parents=True, exist_ok=True)
     for device in options.devices or ["cpu"]:

@@ -1,4 +1,4 @@
-"""A USD stage with diffuse materials, polygons, lights and cameras, written so that it can be read."""
+"""Builds a USD stage of diffuse materials, polygon meshes, lights and cameras, as text that is easy to read."""
 
 import math
 
@@ -8,12 +8,12 @@ from shapes import BOX_FACES, box_points
 
 
 def rounded(values, digits=5):
-    """Python floats with few digits, and no minus zero."""
+    """Python floats, rounded to `digits` decimals, without negative zero."""
     return (np.round(np.asarray(values, dtype=np.float64), digits) + 0.0).tolist()
 
 
 class Builder:
-    """A stage under construction, and the few verbs that the scenes need."""
+    """A stage under construction, with the methods that the test scenes need."""
 
     def __init__(self, doc, meters_per_unit=1.0):
         self.stage = Usd.Stage.CreateInMemory()
@@ -25,7 +25,7 @@ class Builder:
         self.stage.SetDefaultPrim(UsdGeom.Xform.Define(self.stage, "/World").GetPrim())
 
     def material(self, name, albedo, emission=None, texture=None):
-        """A diffuse material; `texture` names a picture in `textures/`, `albedo` is then its mean."""
+        """Adds a diffuse material; `texture` names an image in `textures/`, whose mean is then `albedo`."""
         path = Sdf.Path("/World/Looks").AppendChild(name)
         UsdGeom.Scope.Define(self.stage, path.GetParentPath())
         material = UsdShade.Material.Define(self.stage, path)
@@ -45,7 +45,7 @@ class Builder:
         return material
 
     def _texture(self, path, name, mean):
-        """UsdUVTexture of `textures/<name>.png` read at the primvar `st`; returns its rgb output."""
+        """Adds a UsdUVTexture of `textures/<name>.png` that reads the primvar `st`; returns its rgb output."""
         reader = UsdShade.Shader.Define(self.stage, path.AppendChild("St"))
         reader.CreateIdAttr("UsdPrimvarReader_float2")
         reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
@@ -61,11 +61,11 @@ class Builder:
         return texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
 
     def bind(self, prim, material):
-        """Bind `material` to a prim and what lies below it."""
+        """Binds `material` to a prim and its descendants."""
         UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
 
     def mesh(self, path, points, faces, material=None, *, st=None, normals=None, digits=5):
-        """A polygon mesh under /World; `faces` are sequences of point indices."""
+        """Adds a polygon mesh under /World; `faces` are sequences of point indices."""
         mesh = UsdGeom.Mesh.Define(self.stage, f"/World/{path}")
         points = np.asarray(rounded(points, digits))
         mesh.CreatePointsAttr([Gf.Vec3f(*p) for p in points.tolist()])
@@ -85,23 +85,26 @@ class Builder:
         return mesh
 
     def quad(self, path, corners, material, *, st=None):
-        """One rectangle; its front is the side from which the corners run counter-clockwise."""
+        """Adds a quadrilateral; seen from its front the corners run counter-clockwise."""
         return self.mesh(path, corners, [(0, 1, 2, 3)], material, st=st)
 
     def box(self, path, lower, upper, material=None, *, inward=False, digits=5):
-        """An axis-aligned box of six faces that look outward, or `inward`."""
+        """Adds an axis-aligned box whose six faces have their front outside, or inside if `inward` is set."""
         faces = BOX_FACES[:, ::-1] if inward else BOX_FACES
         return self.mesh(path, box_points(lower, upper), faces, material, digits=digits)
 
     def room(self, lower, upper, **materials):
-        """Six inward faces, one mesh each; `materials` by left right floor ceiling back front, or `other`."""
+        """Adds a box of six meshes with their front inside.
+
+        `materials` are given by the names left, right, floor, ceiling, back and front, and `other` for the rest.
+        """
         points = box_points(lower, upper)
         names = ("left", "right", "floor", "ceiling", "back", "front")
         for name, face in zip(names, BOX_FACES[:, ::-1], strict=True):
             self.quad(f"Room/{name}", points[face], materials.get(name, materials.get("other")))
 
     def place(self, prim, translate=(0, 0, 0), rotate=(0, 0, 0), scale=None):
-        """Author the transform: scale, then rotations about X, Y, Z [degrees], then the translation."""
+        """Authors a transform: scale, then rotations about X, Y and Z [degrees], then the translation."""
         xform = UsdGeom.Xformable(prim)
         xform.AddTranslateOp().Set(Gf.Vec3d(*rounded(translate)))
         if any(rotate):
@@ -111,13 +114,13 @@ class Builder:
         return prim
 
     def aim(self, prim, position, target):
-        """Put a camera or light at `position`, its -Z towards `target`, +Y as upright as can be."""
+        """Places a camera or light at `position`, -Z towards `target`, +Y as close to the up axis as possible."""
         x, y, z = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
         pitch, yaw = math.degrees(math.asin(y)), math.degrees(math.atan2(-x, -z)) if abs(y) < 1 else 0.0
         return self.place(prim, position, (pitch, yaw, 0.0))
 
     def light(self, schema, name, color, intensity, **inputs):
-        """A UsdLux light; `inputs` by their names without the prefix `inputs:`."""
+        """Adds a UsdLux light; `inputs` are named without the prefix `inputs:`."""
         light = schema.Define(self.stage, f"/World/Lights/{name}")
         light.CreateColorAttr(Gf.Vec3f(*rounded(color, 3)))
         light.CreateIntensityAttr(intensity)
@@ -136,7 +139,7 @@ class Builder:
         shift=0.0,
         clip=(0.01, 1000.0),
     ):
-        """A pinhole camera; only the ratios of aperture and `shift` (upward) to focal length matter."""
+        """Adds a pinhole camera; only the ratios of aperture and of `shift` (upwards) to the focal length matter."""
         camera = UsdGeom.Camera.Define(self.stage, f"/World/{name}")
         camera.CreateFocalLengthAttr(focal)
         camera.CreateHorizontalApertureAttr(aperture[0])

@@ -1,18 +1,18 @@
-"""Shapes of the test scenes: points float64 [n, 3] and faces, which are sequences of point indices."""
+"""Shapes of the test scenes: points, float64 [n, 3], and faces, which are sequences of point indices."""
 
 import numpy as np
 
 BOX_FACES = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-"""Faces -x +x -y +y -z +z of the corners that `box_points` returns, counter-clockwise from outside."""
+"""The faces -x, +x, -y, +y, -z, +z of the corners that `box_points` returns, counter-clockwise seen from outside."""
 
 
 def box_points(lower, upper):
-    """The eight corners, z fastest, float64 [8, 3]."""
+    """The eight corners of a box, float64 [8, 3]; z varies fastest."""
     return np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
 
 
 def _grid_faces(rows, columns, wrap_rows=False):
-    """Quads of a grid of points [rows, columns] whose columns close up (and rows, if `wrap_rows`)."""
+    """Quads of a grid of points [rows, columns] that is closed along its columns, and along its rows if `wrap_rows`."""
     i = np.arange(rows if wrap_rows else rows - 1)[:, None]
     j = np.arange(columns)[None, :]
     index = [((i + a) % rows) * columns + (j + b) % columns for a, b in ((0, 0), (0, 1), (1, 1), (1, 0))]
@@ -20,7 +20,7 @@ def _grid_faces(rows, columns, wrap_rows=False):
 
 
 def unit_sphere(rows, columns):
-    """A closed sphere with poles on the Y axis: directions, and faces that look outward."""
+    """A closed unit sphere with poles on the Y axis: points, and faces with their front outside."""
     theta = np.pi * np.arange(1, rows) / rows
     phi = 2.0 * np.pi * np.arange(columns) / columns
     ring = np.stack([np.cos(phi), np.zeros(columns), -np.sin(phi)], axis=-1)
@@ -35,7 +35,7 @@ def unit_sphere(rows, columns):
 
 
 def boulder(rows=18, columns=36):
-    """A lumpy sphere that stands on y = 0."""
+    """An irregular sphere that stands on y = 0."""
     points, faces = unit_sphere(rows, columns)
     x, y, z = points.T
     bumps = np.sin(5 * x + 1) * np.sin(4 * y + 2) * np.sin(6 * z) + 0.5 * np.sin(11 * x) * np.sin(9 * y + 1)
@@ -44,7 +44,7 @@ def boulder(rows=18, columns=36):
 
 
 def vase(rows=20, columns=40):
-    """A fluted vase on y = 0: closed below, and above by its own narrow neck."""
+    """A fluted vase that stands on y = 0, a closed surface with a narrow neck."""
     points, faces = unit_sphere(rows, columns)
     height = 0.5 - 0.5 * points[:, 1]
     angle = np.arctan2(points[:, 2], points[:, 0])
@@ -74,7 +74,7 @@ def knot(rows=96, columns=9, tube=0.075):
 
 
 def chair():
-    """A chair of six boxes on y = 0 that looks along +z."""
+    """A chair of six boxes that stands on y = 0 and faces +z."""
     parts = [((-0.2, 0.42, -0.2), (0.2, 0.46, 0.2)), ((-0.2, 0.6, -0.2), (0.2, 0.95, -0.16))]
     parts += [((x, 0.0, z), (x + 0.04, 0.42 if z > 0 else 0.6, z + 0.04)) for x in (-0.2, 0.16) for z in (-0.2, 0.16)]
     points = np.concatenate([box_points(*part) for part in parts])

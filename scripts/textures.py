@@ -1,4 +1,4 @@
-"""Textures of the test scenes: sRGB pixels uint8 [256, 256, 3], row 0 at the top."""
+"""Textures of the test scenes: sRGB pixels, uint8 [256, 256, 3], row 0 at the top."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ TEXTURES = {"planks": _planks, "bricks": _bricks, "rug": _rug}
 
 
 def linear_mean(pixels):
-    """Mean of the linear values of sRGB pixels, float64 [3]."""
+    """The mean of sRGB pixels after conversion to linear values, float64 [3]."""
     value = pixels / 255.0
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return linear.mean(axis=(0, 1))

@@ -1,8 +1,8 @@
-"""Draws the virtual point lights of a USD stage, one picture per length of the light paths.
+"""Draws the virtual point lights of a USD stage, one picture for each maximum length of the light paths.
 
-python scripts/visualize_vpls.py scenes_usd/cornell_box.usda cloud.png --max-bounces 3
+    python scripts/visualize_vpls.py scenes_usd/cornell_box.usda cloud.png --max-bounces 3
 
-writes cloud.0.png (only points on the lights), cloud.1.png (and the first surfaces they reach), ...
+writes cloud.0.png (VPLs on the lights), cloud.1.png (also on the first surfaces that light paths hit), ...
 """
 
 import argparse
@@ -16,11 +16,15 @@ from warp_ir.preview import picture_vpls
 def main() -> None:
     parser = argparse.ArgumentParser(description="Draw the virtual point lights of a USD stage.")
     parser.add_argument("stage", metavar="STAGE", help="USD file")
-    parser.add_argument("output", metavar="OUTPUT", type=Path, help="a .png; the number of bounces is put in its name")
+    parser.add_argument(
+        "output", metavar="OUTPUT", type=Path, help=".png file; the number of bounces is added to its name"
+    )
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
-    parser.add_argument("--light-paths", type=int, default=1024, help="(default: 1024)")
-    parser.add_argument("--max-bounces", type=int, default=3, help="of the last picture (default: 3)")
-    parser.add_argument("--view", choices=("camera", "outside"), default="outside", help="(default: outside)")
+    parser.add_argument("--light-paths", type=int, default=1024, help="light paths per iteration (default: 1024)")
+    parser.add_argument(
+        "--max-bounces", type=int, default=3, help="maximum number of bounces in the last picture (default: 3)"
+    )
+    parser.add_argument("--view", choices=("camera", "outside"), default="outside", help="viewpoint (default: outside)")
     args = parser.parse_args()
 
     scene = ir.load_usd(args.stage)

@@ -161,7 +161,8 @@ def test_interruption_leaves_a_picture(tmp_path, number):
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
     assert (
-        re.fullmatch(r"warp-ir: \S+: from here --resume goes on\nwarp-ir: interrupted\n", err) and "iterations" in out
+        re.fullmatch(r"warp-ir: \S+: --resume continues from this checkpoint\nwarp-ir: interrupted\n", err)
+        and "iterations" in out
     )
     assert read_image(picture).shape == (8, 8, 4)
     assert json.loads(stats.read_text())["interrupted"] is True
@@ -290,7 +291,7 @@ def test_the_process_ends_in_order(stage, code):
         (["compare", ROOM, "--times", "1,,2"], "--times: not a number: ''"),
         (["compare", ROOM, "--seeds", "0"], "--seeds: must be a whole number from 1 to 1000, is '0'"),
         (["compare", ROOM, "--methods", "vpl, magic"], "unknown 'magic'; known are vpl, vpl without filter"),
-        (["compare", ROOM, "--methods", ","], "--methods: names none"),
+        (["compare", ROOM, "--methods", ","], "--methods: names no method"),
         (["compare", ROOM, "--iterations", "4"], "unrecognized arguments: --iterations 4"),
         (["compare", ROOM, "--width", "0"], "--width: must be a whole number of at least 1, is 0"),
         (["compare", "missing.usda"], "missing.usda: no such file"),
@@ -512,8 +513,8 @@ def curve(method, *points):
 def test_compare_recommends_the_smallest_error():
     """Errors that fall as 1/t and as 1/√t, in closed form; what the reference cannot tell apart is level."""
     fast, slow = curve("path", (1.0, 0.04), (4.0, 0.01)), curve("vpl", (1.0, 0.012), (4.0, 0.006))
-    verdict = compare.judge([*slow, *fast], 1e-6)
-    assert (verdict.method, verdict.flags, verdict.level) == ("vpl", "", [])
+    verdict = compare.recommend([*slow, *fast], 1e-6)
+    assert (verdict.method, verdict.flags, verdict.ties) == ("vpl", "", [])
     between, beyond = verdict.seconds[0.01], verdict.seconds[0.001]
     assert between[1] and between[0] == pytest.approx(4.0 ** (math.log(1.2) / math.log(2.0)))
     assert not beyond[1] and beyond[0] == pytest.approx(4.0 * 6.0**2)
@@ -521,11 +522,11 @@ def test_compare_recommends_the_smallest_error():
     assert compare.seconds_to(0.001, [(1.0, 0.02), (4.0, 0.02)]) is None
     assert compare.seconds_to(0.001, [(1.0, 0.06), (4.0, 0.06 / 1.1)]) is None
     assert compare.seconds_to(1e-9, [(1.0, 1e60), (4.0, 0.9e60)]) is None  # no overflow
-    level = compare.judge([*slow, *fast], 0.02)
-    assert (level.method, level.level) == ("vpl", ["path"])
+    level = compare.recommend([*slow, *fast], 0.02)
+    assert (level.method, level.ties) == ("vpl", ["path"])
     late = [compare.Run("keller", 1.0, None, 40.0, 1, 0.001, 0.0)]  # 0.01 at 4 s, as iterations are independent
-    assert compare.judge([*slow, *late], 1e-6).method == "vpl"
-    assert "relMSE 0.001 in about 2.4 min" in compare.in_words(verdict, 4.0)
+    assert compare.recommend([*slow, *late], 1e-6).method == "vpl"
+    assert "relMSE 0.001 in about 2.4 min" in compare.recommendation_text(verdict, 4.0)
 
 
 # ---- arguments -------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def test_kill_loses_no_more_than_an_interval(tmp_path):
         [sys.executable, "-m", "warp_ir", *command(picture, "--iterations", iterations, "--resume")],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert f"goes on after {done} iterations" in resumed.stderr and f"{iterations} iterations" in resumed.stdout
+    assert f"continues after {done} iterations" in resumed.stderr and f"{iterations} iterations" in resumed.stdout
     assert main(command(other, "--iterations", iterations, "-q")) == 0
     np.testing.assert_array_equal(read_image(picture), read_image(other))
     # What kill leaves of a file half written is hidden and of no meaning.
@@ -99,7 +99,7 @@ def test_a_resumed_animation_keeps_the_pictures_it_has(tmp_path, capsys):
     (tmp_path / "1.npy").write_bytes(b"mine")
     capsys.readouterr()
     assert main([*frames, "1:3", "--resume"]) == 0
-    assert capsys.readouterr().err.count("is there already") == 2
+    assert capsys.readouterr().err.count("exists and is skipped") == 2
     assert (tmp_path / "1.npy").read_bytes() == b"mine" and read_image(tmp_path / "3.npy").shape[1] == 16
 
 

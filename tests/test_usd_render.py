@@ -245,7 +245,7 @@ def test_info_tells_what_materials_are(tmp_path, capsys, monkeypatch):
     assert main(["info", str(file), "-q"]) == 0
     out = capsys.readouterr().out
     assert (
-        ", a.png  /A" in out and ", opacity 0.5  /B" in out and "3 to 4; this is 3" in out and "0.01 m per unit" in out
+        ", a.png  /A" in out and ", opacity 0.5  /B" in out and "3 to 4; read at 3" in out and "0.01 m per unit" in out
     )
     assert "2 meshes" in out and "prims outside pass" not in out
 

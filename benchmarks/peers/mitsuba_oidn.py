@@ -1,22 +1,22 @@
-"""Mitsuba's path tracing, denoised by Open Image Denoise: the best that one gets by installing two packages.
+"""Mitsuba's path tracing, denoised by Open Image Denoise: the best peer that needs only two packages.
 
-The denoiser is given albedo and normals, of up to 16 samples per pixel as long as they take less than a tenth of
-the time. All of it counts: guides, paths and filter.
+The denoiser also gets albedo and normals, with up to 16 samples per pixel as long as they take less than a tenth of
+the time. The measured time includes these guides, the paths and the denoiser.
 """
 
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pyoidn
 from make_references import to_mitsuba
-from methods import Run, Task
+from methods import Pixels, Run, Task
 
 from peers.mitsuba_path import MitsubaPath
 
 GUIDE_SAMPLES = (16, 4, 1)
+"""Samples per pixel of the guides, in order of preference."""
 
 
 class MitsubaDenoised:
@@ -31,10 +31,10 @@ class MitsubaDenoised:
         self._paths = paths
 
     def prepare(self, task: Task, budgets: list[float]) -> dict[str, float]:
-        """Prepares the paths, and times the guides and the filter; seconds by step."""
+        """Prepares the path tracer and times the guides and the denoiser; returns seconds by step."""
         setup = self._paths.prepare(task, budgets)
         begin = time.perf_counter()
-        # Guides show surfaces: the lights of a `Scene` are none, and would stand in the way in Mitsuba.
+        # The guides show surfaces. The lights of a `Scene` are not surfaces, but would hide some in Mitsuba.
         self._surfaces = to_mitsuba(dataclasses.replace(task.scene, lights=()), task.width, task.height)
         self._aovs = self._mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
         guides = self._guides(1, 0)
@@ -43,7 +43,7 @@ class MitsubaDenoised:
         return {**setup, "compile": setup["compile"] + time.perf_counter() - begin}
 
     def render(self, seconds: float, seed: int) -> Run:
-        """A denoised picture that takes `seconds` in all."""
+        """Renders a denoised picture that takes `seconds` in total."""
         samples = next((n for n in GUIDE_SAMPLES if self._guide_cost[n] < 0.1 * seconds), 1)
         begin = time.perf_counter()
         guides = self._guides(samples, seed)
@@ -51,20 +51,20 @@ class MitsubaDenoised:
         picture = _denoise(run.picture, *guides)
         return Run(picture, time.perf_counter() - begin, run.samples)
 
-    def _guides(self, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def _guides(self, samples: int, seed: int) -> tuple[Pixels, Pixels]:
         """Albedo and shading normals, float32 [height, width, 3]."""
         layers = np.array(self._mi.render(self._surfaces, integrator=self._aovs, spp=samples, seed=seed))
         layers = layers.astype(np.float32, copy=False)[..., -6:]
         return np.clip(layers[..., :3], 0.0, 1.0), layers[..., 3:]
 
 
-def _denoise(picture: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _denoise(picture: Pixels, albedo: Pixels, normal: Pixels) -> Pixels:
     color = np.ascontiguousarray(picture, np.float32)
     return np.asarray(pyoidn.denoise(color, albedo, normal, hdr=True))
 
 
-def _seconds(work: Callable[[], Any]) -> float:
-    """What it takes, warm and undisturbed."""
+def _seconds(work: Callable[[], object]) -> float:
+    """The shortest of three durations [s], after a warm-up."""
     times = []
     for _ in range(4):
         begin = time.perf_counter()

@@ -1,9 +1,9 @@
-"""The command `warp-ir`: whatever goes wrong ends in one line on stderr and an exit code.
+"""The command `warp-ir`: every failure is reported as one line on stderr and an exit code.
 
-0: done; 1: internal error; 2: the input or the command line is wrong; 130, 143: stopped by Ctrl-C or
-SIGTERM, the picture so far is written.
+Exit codes: 0: done; 1: internal error; 2: the input or the command line is wrong; 130 and 143: stopped by Ctrl-C or
+by SIGTERM, after the picture so far has been written.
 
-Nothing heavy (Warp, USD, a picture library) is imported before a command needs it.
+Heavy packages (Warp, USD, image libraries) are imported only when a command needs them.
 """
 
 import atexit
@@ -15,7 +15,8 @@ import threading
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, NoReturn
+from types import FrameType
+from typing import NoReturn
 
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import say
@@ -23,18 +24,18 @@ from warp_ir.scene import InputError
 
 
 class Terminated(BaseException):
-    """SIGTERM arrived; like KeyboardInterrupt, it unwinds so that nothing half-written stays behind."""
+    """SIGTERM arrived. Like KeyboardInterrupt it unwinds the stack, so that no half-written file is left behind."""
 
 
 def command() -> NoReturn:
-    """The process `warp-ir`: `main`, and the end of it.
+    """Runs `main` and ends the process `warp-ir` with its exit code.
 
-    Python would take apart every object of Warp, NumPy and USD, for half a second. The system does it at once.
+    `os._exit` skips the destructors of all objects of Warp, NumPy and USD, which would take half a second.
     """
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):  # no stream, or a broken one
+        with suppress(AttributeError, OSError, ValueError):  # the stream is missing, closed or broken
             stream.flush()
     os._exit(code)
 
@@ -43,15 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line and returns the exit code.
 
     Args:
-        argv: The arguments, by default those of the process.
+        argv: The arguments; None: those of the process.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     verbose = "--verbose" in argv
-    # A file name that the terminal cannot show must not be an error.
+    # A file name that the terminal cannot encode must not raise an error.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")
     in_main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
+    previous_handler = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
         args = parse(argv)
         code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("terminated")
         return 128 + signal.SIGTERM
     except BrokenPipeError:
-        # The reader of our output is gone (`warp-ir info … | head`): nobody is left to be told.
+        # The program that reads our output has ended (`warp-ir info … | head`): report nothing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except MemoryError as error:
@@ -76,10 +77,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(1, "internal error", f"{type(error).__name__}: {error}{hint}", verbose)
     finally:
         if in_main_thread:
-            signal.signal(signal.SIGTERM, before)
+            signal.signal(signal.SIGTERM, previous_handler)
 
 
-def _terminate(signum: int, frame: Any) -> None:
+def _terminate(signum: int, frame: FrameType | None) -> None:
     raise Terminated
 
 

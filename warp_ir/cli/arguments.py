@@ -1,6 +1,6 @@
-"""The command line: what can be said, in the habits of `usdrecord`, and how `--help` explains it.
+"""The command line: its flags, named as in `usdrecord` where that has them, and the texts of `--help`.
 
-The flags for `RenderSettings` are made from its fields: a new field is a new flag.
+The flags for `RenderSettings` are generated from its fields: a new field is a new flag.
 """
 
 import argparse
@@ -8,7 +8,7 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 from warp_ir import __version__
@@ -18,103 +18,105 @@ from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
-_ONLY_PICTURES = {
+_PICTURE_ONLY = {
     *("iterations", "time_limit", "target_error", "visible_lights", "bound_radius"),
     *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space"),
 }
-"""Settings that the light paths alone do not depend on."""
+"""Settings that affect the picture but not the light paths: `warp-ir vpls` has no flags for them."""
 _SHORT = {"width": ("-w",)}
 _OUTPUT = (
-    "picture to write; ### stands for the frame. Or a folder, for all the pictures that the stage's RenderProducts name"
+    "picture to write; ### is replaced by the frame number. Or a folder: every picture that the stage's RenderProducts"
+    " name is written there"
 )
-_LONG_CHOICE = 40
-"""Characters beyond which the choices of a setting do not stand in for its value, but in the text beside it."""
+_MAX_CHOICES_LENGTH = 40
+"""Characters. Longer lists of choices are part of the help text; shorter ones replace the name of the value."""
 LISTS = ("cameras", "lights", "materials", "settings")
 """What `warp-ir info --list` can list."""
-METHODS: Mapping[str, Mapping[str, Any]] = {
+METHODS: Mapping[str, Mapping[str, str | bool]] = {
     "vpl": {},
     "vpl without filter": {"filter": False},
     "vpl denoised": {"denoise": True},
     "keller": {"estimator": "keller"},
     "path": {"estimator": "path"},
 }
-"""What `warp-ir compare` compares: names, and the settings that are not the default."""
-_COMPARED = ("iterations", "time_limit", "target_error", "estimator", "filter", "denoise")
-"""Settings that are for `warp-ir compare` to choose."""
+"""Methods of `warp-ir compare`: their names, and the settings that differ from the defaults."""
+_SET_BY_COMPARE = ("iterations", "time_limit", "target_error", "estimator", "filter", "denoise")
+"""Settings that `warp-ir compare` chooses itself: it has no flags for them."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
-The output's extension chooses the format: .exr (colour, alpha, AOV layers,
+The extension of OUTPUT chooses the format. .exr (colour, alpha, AOV layers,
 metadata), .hdr, .pfm and .npy hold linear radiance; .png and .jpg are
-tone-mapped. Ctrl-C writes the picture so far.
+tone-mapped. Ctrl-C stops the render and writes the picture so far.
 
 examples:
   # 64 iterations, 512 pixels wide
   warp-ir render room.usda room.png
-  # until the estimated error is 1 %, with more layers
+  # until the estimated error is 1 %; also write depth and normals
   warp-ir render room.usda room.exr --target-error 0.01 --aov depth normal
-  # another camera, half a minute, three times as bright as the file says
+  # another camera, 30 seconds, 1.5 stops (2.8 times) brighter
   warp-ir render room.usda room.png --camera Door --time-limit 30 --exposure 1.5
-  # an animation; the same again after a crash, with --resume
+  # an animation; after a crash, run the same command with --resume
   warp-ir render shot.usd shots/####.png --frames 1001:1024 --make-output-path
-  # all pictures that the stage's RenderSettings ask for
+  # all pictures that the stage's RenderProducts ask for
   warp-ir render shot.usd renders/ --make-output-path
-  # in red paint, with a lamp switched off in a layer
+  # select a variant, and change the stage by a session layer
   warp-ir render car.usd car.png --variant '/Car{paint=red}' \\
       --session-layer no_lamp.usda
-  # a second opinion: the same picture by path tracing
+  # the same picture by path tracing, as a check
   warp-ir render room.usda path.png --estimator path --iterations 256
 """
 _VPLS_NOTES = """\
 examples:
-  # a picture of the cloud in the room
+  # a picture of the virtual point lights in the room
   warp-ir vpls room.usda cloud.png
-  # points to look at in usdview
+  # points to view in usdview
   warp-ir vpls room.usda cloud.usda --light-paths 256
   # NumPy arrays: positions, normals, intensity, bounce, directional
   warp-ir vpls room.usda cloud.npz --iteration 3
 """
 _COMPARE_NOTES = """\
-relMSE is the mean of (x - r)^2 / (r^2 + 0.01 m^2), with r the reference and m
-its mean: a scene twice as bright has the same. Ctrl-C tells what there is.
+relMSE is the mean of (x - r)^2 / (r^2 + 0.01 m^2), where x is the picture, r
+the reference and m the mean of r: it does not depend on the brightness of the
+scene. Ctrl-C stops and reports what has been measured.
 
 examples:
-  # a table, and which settings to use
+  # print a table and a recommendation
   warp-ir compare room.usda
-  # also as a plot, for a small picture and longer renders
+  # also plot it, for a small picture and longer renders
   warp-ir compare room.usda error.png --width 256 --times 2,8,32
-  # only these, thrice, against a better reference
+  # only two methods, three seeds, a better reference
   warp-ir compare room.usda --methods 'vpl, path' --seeds 3 \\
       --reference-time 600
 """
 
 
 class _Parser(argparse.ArgumentParser):
-    """Errors become `InputError`: one line, and how to get help."""
+    """Raises errors as `InputError`: one line that names the help option."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments; `command` names the module of this package that carries it out.
+    """Parses the arguments; `command` names the module of this package that executes the command.
 
     Raises:
-        InputError: They make no sense.
+        InputError: The arguments are wrong.
     """
     parser = _Parser(
         prog="warp-ir",
         description="Instant radiosity for USD scenes: diffuse global illumination on CPU and GPU.",
-        epilog="Try: warp-ir render STAGE picture.png; 'warp-ir COMMAND --help' tells all about a command.",
+        epilog="Try: warp-ir render STAGE picture.png; 'warp-ir COMMAND --help' explains a command.",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"warp-ir {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary, notes, fill in (
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
-        ("info", "show what is in a stage, what will be skipped, and why", "", _add_info),
-        ("vpls", "write the virtual point lights: as picture, USD points or arrays", _VPLS_NOTES, _add_vpls),
-        ("compare", "error against time of each method, and which one to use", _COMPARE_NOTES, _add_compare),
+        ("info", "show what a stage contains, what will be skipped, and why", "", _add_info),
+        ("vpls", "write the virtual point lights as a picture, USD points or arrays", _VPLS_NOTES, _add_vpls),
+        ("compare", "measure error against time of each method and recommend one", _COMPARE_NOTES, _add_compare),
     ):
         command = commands.add_parser(
             name,
@@ -127,17 +129,20 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         command.add_argument("stage", metavar="STAGE", help="USD file (.usd .usda .usdc .usdz)")
         fill(command)
         messages = command.add_argument_group("messages")
-        messages.add_argument("--quiet", "-q", action="store_true", help="say nothing but errors")
-        messages.add_argument("--verbose", action="store_true", help="show all warnings, and tracebacks")
-    return parser.parse_args(_joined_names(argv))
+        messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
+        messages.add_argument("--verbose", action="store_true", help="print all warnings, and tracebacks of errors")
+    return parser.parse_args(_join_aov_names(argv))
 
 
-def _joined_names(argv: Sequence[str]) -> list[str]:
-    """Makes ``--aov depth normal room.usda`` ``--aov depth,normal room.usda``: a list that knows its end."""
+def _join_aov_names(argv: Sequence[str]) -> list[str]:
+    """Joins the names after --aov: ``--aov depth normal room.usda`` becomes ``--aov depth,normal room.usda``.
+
+    argparse would otherwise take the positional arguments that follow for further names.
+    """
     joined: list[str] = []
     for word in argv:
-        listing = len(joined) > 1 and joined[-2] == "--aov"
-        if listing and word in AOV_CHANNELS:
+        after_aov_name = len(joined) > 1 and joined[-2] == "--aov"
+        if after_aov_name and word in AOV_CHANNELS:
             joined[-1] += "," + word
         else:
             joined.append(word)
@@ -145,7 +150,7 @@ def _joined_names(argv: Sequence[str]) -> list[str]:
 
 
 def given_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The fields of `RenderSettings` that were given."""
+    """The fields of `RenderSettings` that are given on the command line."""
     given: dict[str, Any] = {name: value for name, value in vars(args).items() if name in _FIELDS}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     if getattr(args, "res", None):
@@ -154,25 +159,26 @@ def given_settings(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def settings_of(args: argparse.Namespace, stage: Mapping[str, Any] | None = None) -> RenderSettings:
-    """The render settings: as given, else as the stage asks, else the defaults.
+    """The render settings: each as given on the command line, else as the stage asks, else its default.
 
     Args:
-        args: The command line.
+        args: The parsed command line.
         stage: Fields of `RenderSettings` that the stage asks for.
 
     Raises:
         InputError: A value is out of range; the message names the flag.
     """
-    given, wanted = given_settings(args), dict(stage or {})
-    if ("width" in given) != ("height" in given) and "width" in wanted:
-        # One side alone: the other follows the shape of the stage's resolution.
+    given, from_stage = given_settings(args), dict(stage or {})
+    if ("width" in given) != ("height" in given) and "width" in from_stage:
+        # Only one side is given: the other follows from the aspect of the stage's resolution.
         side, other = ("width", "height") if "width" in given else ("height", "width")
         if isinstance(given[side], int) and given[side] > 0:
-            wanted[other] = max(1, round(given[side] * wanted[other] / wanted[side]))
-    if {"iterations", "time_limit", "target_error"} & set(given):
-        wanted = {k: v for k, v in wanted.items() if k not in ("iterations", "time_limit", "target_error")}
+            from_stage[other] = max(1, round(given[side] * from_stage[other] / from_stage[side]))
+    limits = {"iterations", "time_limit", "target_error"}
+    if limits & set(given):  # a limit on the command line replaces all limits of the stage
+        from_stage = {name: value for name, value in from_stage.items() if name not in limits}
     try:
-        return RenderSettings(**{**wanted, **given})
+        return RenderSettings(**{**from_stage, **given})
     except InputError as error:
         name, colon, rest = str(error).partition(":")
         raise InputError(f"{_flag(name)}{colon}{rest}" if name in _FIELDS else str(error)) from error
@@ -182,14 +188,14 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("output", metavar="OUTPUT", help=_OUTPUT)
     picture = parser.add_argument_group("picture")
     _add_settings(picture, _FIELDS)
-    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height in one")
-    # usdrecord's names, understood and not advertised.
+    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height together")
+    # The names of usdrecord are accepted, but not listed in the help.
     hidden = argparse.SUPPRESS
-    unsaid: dict[str, Any] = {"default": hidden, "help": hidden}
+    suppressed: dict[str, Any] = {"default": hidden, "help": hidden}
     picture.add_argument("--imageWidth", dest="width", type=int, default=hidden, help=hidden)
-    picture.add_argument("--enableDomeLightVisibility", dest="visible_lights", action="store_true", **unsaid)
-    picture.add_argument("--disableCameraLight", dest="default_light", action="store_const", const="none", **unsaid)
-    picture.add_argument("--disableGpu", dest="device", action="store_const", const="cpu", **unsaid)
+    picture.add_argument("--enableDomeLightVisibility", dest="visible_lights", action="store_true", **suppressed)
+    picture.add_argument("--disableCameraLight", dest="default_light", action="store_const", const="none", **suppressed)
+    picture.add_argument("--disableGpu", dest="device", action="store_const", const="cpu", **suppressed)
     _add_stage(parser)
     output = parser.add_argument_group("output")
     output.add_argument(
@@ -199,77 +205,82 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         type=_names(AOV_CHANNELS),
         default=[],
         metavar="NAME ...",
-        help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files beside it",
+        help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files next to it",
     )
-    stops = "of .png and .jpg: each stop doubles the radiance (default: 0)"
+    stops = "brightness of .png and .jpg: each stop doubles the radiance (default: 0)"
     output.add_argument("--exposure", type=_stops, default=0.0, metavar="STOPS", help=stops)
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
         default=TONEMAPS[0],
-        help="of .png and .jpg: srgb clips highlights, filmic rolls them off (default: srgb)",
+        help="tone curve of .png and .jpg: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
-    output.add_argument("--float", dest="half", action="store_false", help="store .exr with 32 bits, not 16")
-    output.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
-    resume = "keep the pictures that are there, and go on with the one that an earlier command has begun"
+    output.add_argument(
+        "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
+    )
+    output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
+    resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)
-    checkpoint = "how often OUTPUT.film.npz is written for --resume, until OUTPUT is done (default: 60; 0: never)"
+    checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
-    output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory and versions")
+    output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
     _add_device(output)
 
 
 def _add_info(parser: argparse.ArgumentParser) -> None:
     _add_stage(parser, frames=False)
-    parser.add_argument("--json", action="store_true", help="for programs")
-    parser.add_argument("--list", choices=LISTS, metavar="WHAT", help=f"only this, a line each: {', '.join(LISTS)}")
+    parser.add_argument("--json", action="store_true", help="print JSON, for programs")
+    parser.add_argument(
+        "--list", choices=LISTS, metavar="WHAT", help=f"print only these, one per line: {', '.join(LISTS)}"
+    )
 
 
 def _add_vpls(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("output", metavar="OUTPUT", help=".png picture, .usda points, or .npz arrays")
-    cloud = parser.add_argument_group("light paths")
-    _add_settings(cloud, [name for name in _FIELDS if name not in _ONLY_PICTURES])
-    cloud.add_argument("--iteration", type=int, default=0, metavar="N", help="whose paths (default: 0)")
-    cloud.add_argument(
-        "--view", choices=("camera", "outside"), default="outside", help="of the picture (default: outside)"
-    )
-    cloud.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
-    _add_device(cloud)
+    paths = parser.add_argument_group("light paths")
+    _add_settings(paths, [name for name in _FIELDS if name not in _PICTURE_ONLY])
+    number = "number of the iteration whose light paths are traced (default: 0)"
+    paths.add_argument("--iteration", type=int, default=0, metavar="N", help=number)
+    view = "where the picture is taken from: the stage's camera, or outside the scene (default: outside)"
+    paths.add_argument("--view", choices=("camera", "outside"), default="outside", help=view)
+    paths.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
+    _add_device(paths)
     _add_stage(parser, frames=False)
 
 
 def _add_compare(parser: argparse.ArgumentParser) -> None:
-    plot = ".png to plot error against time in (needs the extra 'bench')"
+    plot = ".png file for a plot of error against time (needs the extra 'bench')"
     parser.add_argument("output", metavar="OUTPUT", nargs="?", help=plot)
-    what = parser.add_argument_group("comparison")
-    times = "how long each method renders, in seconds (default: 0.5,1,2,4)"
-    what.add_argument("--times", type=_times, default=[0.5, 1.0, 2.0, 4.0], metavar="S[,S]", help=times)
-    long = "how long path renders the reference (default: ten times the longest of --times)"
-    what.add_argument("--reference-time", type=_duration, metavar="SECONDS", help=long)
-    names = f"what to compare: {', '.join(METHODS)} (default: all that are installed)"
-    what.add_argument("--methods", type=_names(METHODS), metavar="NAME[,NAME]", help=names)
-    what.add_argument("--seeds", type=_count, default=1, metavar="N", help="pictures of each, for medians (default: 1)")
-    what.add_argument("--json", metavar="FILE.json", help="write all numbers")
-    what.add_argument("--make-output-path", action="store_true", help="create the folder of the output")
-    _add_device(what)
-    _add_settings(parser.add_argument_group("picture"), [name for name in _FIELDS if name not in _COMPARED])
+    comparison = parser.add_argument_group("comparison")
+    times = "time limits of each method, in seconds (default: 0.5,1,2,4)"
+    comparison.add_argument("--times", type=_times, default=[0.5, 1.0, 2.0, 4.0], metavar="S[,S]", help=times)
+    reference_time = "time for the reference, rendered by path (default: ten times the longest of --times)"
+    comparison.add_argument("--reference-time", type=_duration, metavar="SECONDS", help=reference_time)
+    methods = f"methods to compare: {', '.join(METHODS)} (default: all that are installed)"
+    comparison.add_argument("--methods", type=_names(METHODS), metavar="NAME[,NAME]", help=methods)
+    seeds = "seeds per method and time; the table shows medians (default: 1)"
+    comparison.add_argument("--seeds", type=_count, default=1, metavar="N", help=seeds)
+    comparison.add_argument("--json", metavar="FILE.json", help="write all numbers")
+    comparison.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
+    _add_device(comparison)
+    _add_settings(parser.add_argument_group("picture"), [name for name in _FIELDS if name not in _SET_BY_COMPARE])
     _add_stage(parser, frames=False)
 
 
-def _add_settings(group: Any, names: Collection[str]) -> None:
-    """A flag for each of the settings; those that are not given stay out of the namespace."""
+def _add_settings(group: argparse._ArgumentGroup, names: Collection[str]) -> None:
+    """Adds a flag for each of the settings; the namespace only has those that are given."""
     hints = typing.get_type_hints(RenderSettings)
     for name in names:
         field = _FIELDS[name]
         doc = str(field.metadata["doc"]).replace("%", "%%")
-        # The one type of `int`, `int | None`, ...
+        # The type other than None in `int`, `int | None`, ...
         kind = next(k for k in typing.get_args(hints[name]) or (hints[name],) if k is not types.NoneType)
         options: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
         if kind is bool:
             options["action"] = argparse.BooleanOptionalAction if field.default else "store_true"
         elif field.metadata.get("choices"):
             options["choices"] = field.metadata["choices"]
-            if len(",".join(options["choices"])) > _LONG_CHOICE:
+            if len(",".join(options["choices"])) > _MAX_CHOICES_LENGTH:
                 doc += f": {', '.join(options['choices'])}"
                 options["metavar"] = "NAME"
         elif isinstance(field.default, tuple):
@@ -284,45 +295,47 @@ def _add_settings(group: Any, names: Collection[str]) -> None:
 
 
 def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
-    hidden = argparse.SUPPRESS  # usdrecord's names, understood and not advertised
+    hidden = argparse.SUPPRESS  # for the names of usdrecord, which are accepted but not listed
     group = parser.add_argument_group("stage")
-    group.add_argument("--camera", "-cam", metavar="NAME", help="path or name (default: the main camera)")
+    group.add_argument("--camera", "-cam", metavar="NAME", help="path or name of the camera (default: the main camera)")
     point: dict[str, Any] = {"nargs": 3, "type": _finite, "metavar": ("X", "Y", "Z")}
-    group.add_argument("--eye", **point, help="stand here, in place of a camera of the stage")
-    group.add_argument("--look-at", **point, help="with --eye: look there (default: the middle of the scene)")
+    group.add_argument("--eye", **point, help="position of the viewer, in place of a camera of the stage")
+    group.add_argument("--look-at", **point, help="with --eye: the point to look at (default: the middle of the scene)")
     when = group.add_mutually_exclusive_group()
     if frames:
-        spec = "101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"
+        spec = "frames to render: 101, 101:105, 101:109x2, or several with commas; OUTPUT needs ###"
         when.add_argument("--frames", "-f", metavar="SPEC", help=spec)
     when.add_argument("--time", type=_finite, metavar="CODE", help="time code (default: the stage's start)")
-    when.add_argument("--default-time", "-d", action="store_true", help="the default time, at which nothing moves")
+    when.add_argument(
+        "--default-time", "-d", action="store_true", help="use the default values of attributes: nothing is animated"
+    )
     when.add_argument("--defaultTime", dest="default_time", action="store_true", help=hidden)
-    wanted = "RenderSettings to honour (default: those the stage names, or its first)"
-    group.add_argument("--render-settings", "-rs", metavar="PRIM", help=wanted)
+    render_settings = "RenderSettings prim to use (default: the one that the stage names, or its first)"
+    group.add_argument("--render-settings", "-rs", metavar="PRIM", help=render_settings)
     group.add_argument("--renderSettingsPrimPath", dest="render_settings", help=hidden)
-    taking = "RenderPass whose settings are used, and of which only what takes part is drawn"
-    group.add_argument("--render-pass", "-rp", metavar="PRIM", help=taking)
+    render_pass = "RenderPass prim: its settings are used, and prims that it excludes are not drawn"
+    group.add_argument("--render-pass", "-rp", metavar="PRIM", help=render_pass)
     group.add_argument("--renderPassPrimPath", dest="render_pass", help=hidden)
     group.add_argument(
         "--purposes",
         type=_names(_PURPOSES),
         metavar="NAME[,NAME]",
-        help="what to draw beside purpose 'default': render, proxy, guide (default: what the RenderSettings"
-        " say, or render)",
+        help="purposes to draw in addition to 'default': render, proxy, guide (default: those of the RenderSettings,"
+        " or render)",
     )
     group.add_argument(
         "--complexity",
         "-c",
         choices=("low", "medium", "high", "veryhigh"),
         default="low",
-        help="of subdivision surfaces: their cages, or one, two, three levels of refinement (default: low)",
+        help="refinement of subdivision surfaces: none (the cage), or one, two or three levels (default: low)",
     )
     group.add_argument(
         "--mask",
         type=_paths,
         default=[],
         metavar="PRIM[,PRIM]",
-        help="load only these prims, and what is above, below and related to them; lights are not by themselves",
+        help="load only these prims, their ancestors and descendants, and what they refer to; lights must be named too",
     )
     group.add_argument(
         "--variant",
@@ -330,33 +343,33 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         action="append",
         default=[],
         metavar="/PRIM{SET=NAME}",
-        help="select a variant; may be given several times",
+        help="select a variant; the flag may be repeated",
     )
-    group.add_argument("--session-layer", metavar="FILE", help="USD file that is stronger than the stage")
+    group.add_argument("--session-layer", metavar="FILE", help="USD file whose opinions are stronger than the stage's")
     group.add_argument("--sessionLayer", dest="session_layer", help=hidden)
     group.add_argument(
         "--default-light",
         choices=("none", "dome"),
         default="dome",
-        help="what lights a stage in which nothing emits (default: dome)",
+        help="light for a stage in which nothing emits (default: dome)",
     )
     group.add_argument(
         "--metals",
         choices=("diffuse", "black"),
         default="diffuse",
-        help="metals as diffuse surfaces of their base colour, or without it (default: diffuse)",
+        help="render metals as diffuse surfaces of their base colour, or as black (default: diffuse)",
     )
     group.add_argument(
         "--texture-wrap",
         choices=("black", "clamp", "repeat", "mirror"),
         default="black",
-        help="textures beyond their edges, where the stage does not say it (default: black)",
+        help="wrap mode of textures for which the stage gives none (default: black)",
     )
-    group.add_argument("--strict", action="store_true", help="what is skipped or guessed is an error")
+    group.add_argument("--strict", action="store_true", help="stop with an error at the first warning about the stage")
 
 
-def _add_device(group: Any) -> None:
-    devices = "cpu, cuda:0, ... (default: auto, the first GPU or else the CPU)"
+def _add_device(group: argparse._ArgumentGroup) -> None:
+    devices = "cpu, cuda:0, ... (default: auto, the first GPU, or the CPU if there is none)"
     group.add_argument("--device", default="auto", metavar="NAME", help=devices)
 
 
@@ -364,15 +377,15 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _names(known: Collection[str]) -> Any:
-    """A type that takes names separated by commas."""
+def _names(known: Collection[str]) -> Callable[[str], list[str]]:
+    """A parser of argument values that are names separated by commas."""
 
     def names(text: str) -> list[str]:
-        found = [name.strip() for name in text.split(",") if name.strip()]
-        for name in found:
+        given = [name.strip() for name in text.split(",") if name.strip()]
+        for name in given:
             if name not in known:
                 raise argparse.ArgumentTypeError(f"unknown {name!r}; known are {', '.join(known)}")
-        return found
+        return given
 
     return names
 

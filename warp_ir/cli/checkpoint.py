@@ -1,4 +1,4 @@
-"""A film beside the picture, now and then: what is lost when the process dies is one interval, not the render."""
+"""Checkpoints: the film is saved next to the picture at intervals, so that a crash loses one interval of work."""
 
 import dataclasses
 import hashlib
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,36 +17,39 @@ from warp_ir.image.io import whole_file
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 
-_SHARE = 0.05
-"""Most of the time that writing checkpoints may take."""
-_FREE = ("iterations", "time_limit", "target_error", "color_space")
-"""Settings that no sample depends on: a render may go on under others."""
-_TALK = ("warnings", "stats", "name", "settings")
-"""What of a scene no pixel depends on."""
+if TYPE_CHECKING:
+    from warp_ir.film import Film
+
+_MAX_TIME_SHARE = 0.05
+"""Largest share of the render time that is spent on writing checkpoints."""
+_UNHASHED_SETTINGS = ("iterations", "time_limit", "target_error", "color_space")
+"""Settings that do not affect the samples: a resumed render may use other values."""
+_UNHASHED_SCENE_FIELDS = ("warnings", "stats", "name", "settings")
+"""Fields of a `Scene` that do not affect the samples."""
 
 
 class Checkpoint:
-    """The checkpoint of one picture: `picture.exr.film.npz`, until the picture is done."""
+    """The checkpoint of one picture, `picture.exr.film.npz`; it is removed when the picture is finished."""
 
-    def __init__(self, output: Path, film: Any, key: Callable[[], str], interval: float) -> None:
-        """Writes nothing yet.
+    def __init__(self, output: Path, film: "Film", key: Callable[[], str], interval: float) -> None:
+        """Prepares a checkpoint; no file is read or written.
 
         Args:
-            output: The picture.
-            film: Its film.
-            key: Gives the `fingerprint` of the scene and the settings; asked when first needed.
-            interval: Seconds between checkpoints; 0: there are none.
+            output: Path of the picture.
+            film: Film of the picture.
+            key: Computes the `fingerprint` of the scene and the settings; called on first use, and once only.
+            interval: Seconds between checkpoints; 0: none are written.
         """
-        self.path = path_of(output)
+        self.path = checkpoint_path(output)
         self._film, self._key, self._interval = film, cache(key), interval
-        self._next = time.monotonic() + interval
+        self._due = time.monotonic() + interval
         self._failed = False
 
     def resume(self) -> bool:
-        """Goes on with the film that is there; whether there is one.
+        """Loads the checkpoint into the film if its file exists, and returns whether it does.
 
         Raises:
-            InputError: It is of another scene or of other settings.
+            InputError: The file is damaged, or belongs to another scene or to other settings.
         """
         if not self.path.exists():
             return False
@@ -56,13 +59,13 @@ class Checkpoint:
             raise InputError(f"--resume: {error}; remove it, or render without --resume") from None
         return True
 
-    def maybe(self) -> None:
-        """Writes the film if it is time."""
-        if self._interval > 0.0 and time.monotonic() >= self._next and not self._failed:
+    def write_if_due(self) -> None:
+        """Writes the film if the interval has passed."""
+        if self._interval > 0.0 and time.monotonic() >= self._due and not self._failed:
             self.write()
 
     def write(self) -> bool:
-        """Writes the film, and says whether it could: if not, that is no reason to stop."""
+        """Writes the film and returns whether that succeeded; a failure is a warning, as the render can continue."""
         if self._film.iterations == 0:
             return False
         begin = time.monotonic()
@@ -73,48 +76,56 @@ class Checkpoint:
             say(f"warning: no checkpoint: {error}")
             self._failed = True
         now = time.monotonic()
-        self._next = now + max(self._interval, (now - begin) / _SHARE)
+        self._due = now + max(self._interval, (now - begin) / _MAX_TIME_SHARE)
         return not self._failed
 
     def remove(self) -> None:
-        """The picture is done."""
+        """Deletes the checkpoint of a finished picture."""
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
 
 
-def path_of(output: Path) -> Path:
-    """Where the checkpoint of a picture is."""
+def checkpoint_path(output: Path) -> Path:
+    """Path of the checkpoint of a picture."""
     return output.with_name(output.name + ".film.npz")
 
 
 def fingerprint(scene: Scene, settings: RenderSettings) -> str:
-    """Of everything that the samples depend on."""
+    """A hash (128 bits, hexadecimal) of everything that the samples depend on."""
     digest = hashlib.blake2b(digest_size=16)
-    how = {name: value for name, value in settings.to_dict().items() if name not in _FREE}
-    digest.update(f"{__version__} {how}".encode())
+    hashed = {name: value for name, value in settings.to_dict().items() if name not in _UNHASHED_SETTINGS}
+    digest.update(f"{__version__} {hashed}".encode())
     _add(digest, scene, {})
     return digest.hexdigest()
 
 
-def _add(digest: Any, value: object, seen: dict[int, int]) -> None:
-    """Adds a value; of a record that is there several times, as in the moments of a shutter, only that it is."""
-    if dataclasses.is_dataclass(value) and seen.setdefault(id(value), len(seen)) < len(seen) - 1:
-        digest.update(f"#{seen[id(value)]}".encode())
+def _add(digest: "hashlib.blake2b", value: object, numbers: dict[int, int]) -> None:
+    """Adds a value to the hash.
+
+    A record that occurs again, as a static mesh does in every shutter sample, is hashed as its number.
+
+    Args:
+        digest: The hash.
+        value: A record, an array, a collection or a plain value.
+        numbers: The id of each record hashed so far -> its number.
+    """
+    if dataclasses.is_dataclass(value) and numbers.setdefault(id(value), len(numbers)) < len(numbers) - 1:
+        digest.update(f"#{numbers[id(value)]}".encode())
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype} {value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         for field in dataclasses.fields(value):
-            if not (isinstance(value, Scene) and field.name in _TALK):
+            if not (isinstance(value, Scene) and field.name in _UNHASHED_SCENE_FIELDS):
                 digest.update(field.name.encode())
-                _add(digest, getattr(value, field.name), seen)
+                _add(digest, getattr(value, field.name), numbers)
     elif isinstance(value, tuple | list):
         digest.update(f"{len(value)}".encode())
         for item in value:
-            _add(digest, item, seen)
+            _add(digest, item, numbers)
     elif isinstance(value, frozenset | set):
-        _add(digest, tuple(sorted(value)), seen)
+        _add(digest, tuple(sorted(value)), numbers)
     elif isinstance(value, Mapping):
-        _add(digest, tuple(value.items()), seen)
+        _add(digest, tuple(value.items()), numbers)
     else:
         digest.update(repr(value).encode())

@@ -1,4 +1,4 @@
-"""Which device a command runs on."""
+"""Chooses the device on which a command runs."""
 
 from warp_ir.cli.console import muted_stderr
 from warp_ir.cli.import_guard import importing
@@ -10,23 +10,23 @@ def open_device(name: str, *, verbose: bool = False) -> str:
 
     Args:
         name: "cpu", "cuda", "cuda:N", or "auto" for the first GPU or else the CPU.
-        verbose: Whether Warp may talk.
+        verbose: Whether Warp may print messages.
 
     Raises:
-        InputError: There is no such device; the message names those that there are.
+        InputError: The device does not exist; the message names those that do.
     """
     with importing():
         import warp as wp
 
-    # This process is ours: Warp reports through our messages, or not at all.
+    # The command owns the process: its own messages replace those of Warp.
     wp.config.log_level = wp.LOG_INFO if verbose else wp.LOG_ERROR
     with muted_stderr(not verbose):
         devices = [str(device) for device in wp.get_devices()]
     gpus = [device for device in devices if device.startswith("cuda")]
     if name in ("auto", "cuda"):
-        wanted = gpus[0] if gpus else "cpu" if name == "auto" else name
+        chosen = gpus[0] if gpus else "cpu" if name == "auto" else name
     else:
-        wanted = name
-    if wanted not in devices:
+        chosen = name
+    if chosen not in devices:
         raise InputError(f"--device: {name!r} is not available; available: {', '.join(devices)}")
-    return wanted
+    return chosen

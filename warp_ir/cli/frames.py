@@ -1,4 +1,4 @@
-"""Frame numbers, and the names of their files: `101:105` and `shot.####.png`, as usdrecord has them."""
+"""Frame specifications and the names of the frames' files, `101:105` and `shot.####.png`, as in usdrecord."""
 
 import re
 from pathlib import Path
@@ -6,21 +6,21 @@ from pathlib import Path
 from warp_ir.cli.import_guard import importing
 from warp_ir.scene import InputError
 
-Moment = float | str | None
-"""A time code; "default" for the default time, None for the stage's start."""
+TimeCode = float | str | None
+"""A time code; "default": the default time; None: the stage's start."""
 _MAX_FRAMES = 1_000_000
 
 
-def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Path]:
-    """Time code -> the file to write; the one key is `time` if no frames are asked for.
+def outputs_of(output: str, frames: str | None, time: TimeCode) -> dict[TimeCode, Path]:
+    """The file to write for each time code; without `frames` there is one, for `time`.
 
     Args:
-        output: Path, with one placeholder (`###`, or `###.##` for fractions) if there are frames.
+        output: Path; with `frames` it has one placeholder (`###`, or `###.##` for fractions).
         frames: `101`, `101:105`, `105:101`, `101:109x2`, `101:104x0.5`, or several with commas.
         time: Time code of a single picture.
 
     Raises:
-        InputError: The frames make no sense, or the placeholder is missing or too short for them.
+        InputError: The frames cannot be parsed, or the placeholder is missing or has too few decimals.
     """
     if frames is None:
         return {time: Path(output)}
@@ -29,7 +29,7 @@ def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Pa
     if len(placeholders) != 1:
         raise InputError(f"--frames: the output needs one placeholder such as ### for the frame: {output}")
     width, digits = len(placeholders[0]), len(placeholders[0].partition(".")[2])
-    outputs: dict[Moment, Path] = {}
+    outputs: dict[TimeCode, Path] = {}
     for frame in codes:
         if round(frame, digits) != frame:
             raise InputError(f"--frames: {frame:g} needs a placeholder with decimals, ###.##: {output}")
@@ -38,7 +38,11 @@ def outputs_of(output: str, frames: str | None, time: Moment) -> dict[Moment, Pa
 
 
 def time_codes(spec: str) -> list[float]:
-    """The numbers of a frame specification, without repetitions."""
+    """The frame numbers of a specification in its order, each once.
+
+    Raises:
+        InputError: The specification cannot be parsed, or has more than a million frames.
+    """
     with importing():
         from pxr import Tf, UsdUtils
 

@@ -1,18 +1,22 @@
-"""`warp-ir info`: what is in a stage, what will be skipped, and why."""
+"""`warp-ir info`: prints what a stage contains, what will be skipped, and why."""
 
 import argparse
 import json
 import math
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_ir.cli.console import say_warnings
-from warp_ir.cli.stage_options import moment_of, open_reader, stage_facts
+from warp_ir.cli.frames import TimeCode
+from warp_ir.cli.stage_options import open_reader, stage_facts, time_code_of
 from warp_ir.memory import scene_bytes
 from warp_ir.scene import Light, LightKind, Material, Mesh, MeshLight, Scene
+
+if TYPE_CHECKING:
+    from warp_ir.usd import StageReader
 
 _SKIPPED = (
     "prims_invisible",
@@ -24,36 +28,43 @@ _SKIPPED = (
     "lights_without_emission",
     "composition_errors",
 )
-"""Counts of what a stage has and the picture does not."""
-_LINES = 20
-"""Lights, materials, ... listed by name before only their number is told; --verbose lists all."""
+"""Counts in `Scene.stats` of what is in the stage but not in the picture."""
+_MAX_LINES = 20
+"""Lights, materials, ... that are listed by name; of further ones only the number is printed, unless --verbose."""
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the table, or JSON; the exit code."""
+    """Prints the table, a list or JSON; returns the exit code."""
     begin = time.perf_counter()
     reader = open_reader(args)
-    scene = reader.read(moment_of(args))
-    facts = describe(scene, reader, time.perf_counter() - begin, moment_of(args))
+    scene = reader.read(time_code_of(args))
+    facts = describe(scene, reader, time.perf_counter() - begin, time_code_of(args))
     if args.list:
         _print_list(facts, args.list)
         return 0
     if args.json:
         print(json.dumps({**facts, "warnings": list(scene.warnings)}, indent=2))
         return 0
-    _print_table(facts, math.inf if args.verbose else _LINES)
+    _print_table(facts, math.inf if args.verbose else _MAX_LINES)
     if not args.quiet:
         say_warnings(scene.warnings, everything=args.verbose)
     return 0
 
 
-def describe(scene: Scene, reader: Any, seconds: float, moment: float | str | None) -> dict[str, Any]:
-    """The scene in plain values, with what only the stage itself knows, and the seconds it took to load."""
+def describe(scene: Scene, reader: "StageReader", seconds: float, time_code: TimeCode) -> dict[str, Any]:
+    """The scene and its stage as plain values for JSON.
+
+    Args:
+        scene: The scene.
+        reader: Reader of its stage.
+        seconds: Time [s] it took to load.
+        time_code: Time code at which it was read.
+    """
     lower, upper = scene.bounds()
-    camera, cost, known = scene.camera, scene_bytes(scene), stage_facts(reader, moment)
+    camera, size, facts = scene.camera, scene_bytes(scene), stage_facts(reader, time_code)
     return {
         "stage": str(reader.source),
-        **known,
+        **facts,
         "camera": {
             "name": scene.camera.name,
             "projection": scene.camera.projection.name.lower(),
@@ -67,7 +78,7 @@ def describe(scene: Scene, reader: Any, seconds: float, moment: float | str | No
             "shutter_moments": len(scene.shutter),
         },
         "moving_meshes": reader.moving_meshes,
-        "cost": {"load_seconds": seconds, "scene_bytes": sum(cost.values()), "bytes": cost},
+        "cost": {"load_seconds": seconds, "scene_bytes": sum(size.values()), "bytes": size},
         "meshes": len(scene.meshes),
         "triangles": scene.triangle_count,
         "triangles_seen": scene.triangles_seen,
@@ -87,7 +98,7 @@ def describe(scene: Scene, reader: Any, seconds: float, moment: float | str | No
         "emissive_triangles": _emissive_triangles(scene),
         "counts": {key: int(value) for key, value in scene.stats.items()},
         "skipped": {key: int(scene.stats[key]) for key in _SKIPPED if scene.stats.get(key)},
-        "guessed": _guesses(scene, known["cameras"]),
+        "guessed": _guesses(scene, facts["cameras"]),
     }
 
 
@@ -97,7 +108,7 @@ def _light(light: Light) -> dict[str, Any]:
         "kind": light.kind.name.lower(),
         "radiance": _floats(light.radiance),
         "texture": None if light.texture is None else list(light.texture.shape[1::-1]),
-        **_control(light),
+        **_modifiers(light),
     }
 
 
@@ -108,12 +119,12 @@ def _mesh_light(mesh: Mesh, scene: Scene) -> dict[str, Any]:
         "name": mesh.light.name,
         "mesh": mesh.name,
         "radiance": _floats(np.max(emission, axis=0)),
-        **_control(mesh.light),
+        **_modifiers(mesh.light),
     }
 
 
-def _control(light: Light | MeshLight) -> dict[str, Any]:
-    """What is said of a light beyond its radiance and shape."""
+def _modifiers(light: Light | MeshLight) -> dict[str, Any]:
+    """Shaping, shadows and links of a light."""
     shaping = light.shaping
     return {
         "shaping": None
@@ -143,17 +154,17 @@ def _material(material: Material) -> dict[str, Any]:
 
 
 def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
-    """What the stage leaves open, and how it was decided."""
-    found = {}
+    """What the stage does not specify, and what was chosen for it."""
+    guesses = {}
     if scene.camera.name not in cameras:
-        found["camera"] = "one that frames the scene from outside, for there is none"
+        guesses["camera"] = "one that frames the scene from outside (the stage has none)"
     elif any("rendered because it is the first" in line for line in scene.warnings):
-        found["camera"] = f"the first of {len(cameras)}"
+        guesses["camera"] = f"the first of {len(cameras)}"
     if any("used because they are the first of" in line for line in scene.warnings):
-        found["settings"] = "the first there are"
+        guesses["settings"] = "the first RenderSettings of the stage"
     if any(light.name == "default dome" for light in scene.lights):
-        found["light"] = "a white dome of radiance 1, for nothing emits"
-    return found
+        guesses["light"] = "a white dome of radiance 1 (nothing emits)"
+    return guesses
 
 
 def _floats(values: Iterable[float]) -> list[float]:
@@ -165,52 +176,54 @@ def _emissive_triangles(scene: Scene) -> int:
     return sum(int(emits[mesh.material].sum()) for mesh in scene.meshes)
 
 
-def _print_table(facts: dict[str, Any], most: float) -> None:
-    """One fact a line, the names aligned."""
+def _print_table(facts: dict[str, Any], max_lines: float) -> None:
+    """Prints one fact per line with aligned names; at most `max_lines` of each list."""
     camera, (lower, upper) = facts["camera"], facts["bounds"]
     cost = facts["cost"]
     _row("stage", facts["stage"])
     _row("up axis", f"{facts['up_axis']}, {facts['meters_per_unit']:g} m per unit")
     if facts["frames"]:
-        (first, last), at = facts["frames"], facts["time"]
-        _row("frames", f"{first:g} to {last:g}; this is {'the default time' if at is None else f'{at:g}'}")
+        (first, last), time_code = facts["frames"], facts["time"]
+        _row(
+            "frames", f"{first:g} to {last:g}; read at {'the default time' if time_code is None else f'{time_code:g}'}"
+        )
     _row(
         "camera",
-        f"{camera['name'] or '(around it all)'}, {camera['projection']}, aspect {camera['aspect']:.4g}",
+        f"{camera['name'] or '(frames the scene)'}, {camera['projection']}, aspect {camera['aspect']:.4g}",
     )
-    _list("other cameras", [name for name in facts["cameras"] if name != camera["name"]], most)
+    _list("other cameras", [name for name in facts["cameras"] if name != camera["name"]], max_lines)
     if camera["lens_radius"] > 0.0:
         _row("lens", f"radius {camera['lens_radius']:.4g}, in focus at {camera['focus_distance']:.4g}")
     if camera["shutter_moments"]:
-        _row("motion blur", f"of {camera['shutter_moments']} moments")
+        _row("motion blur", f"{camera['shutter_moments']} shutter samples")
     if camera["exposure"] != 1.0:
         _row("exposure", f"{camera['exposure']:.4g} times the radiance")
-    _list("settings", _settings_lines(facts), most)
-    _list("render passes", facts["render_passes"], most)
-    moving = f", {facts['moving_meshes']} of them move or change" if facts["moving_meshes"] else ""
+    _list("settings", _settings_lines(facts), max_lines)
+    _list("render passes", facts["render_passes"], max_lines)
+    moving = f", {facts['moving_meshes']} of them animated" if facts["moving_meshes"] else ""
     _row("meshes", f"{facts['meshes']}{moving}")
-    seen = f"; {facts['triangles_seen']} are seen" if facts["prototypes"] else ""
-    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit{seen}")
+    instanced = f"; {facts['triangles_seen']} with instances" if facts["prototypes"] else ""
+    _row("triangles", f"{facts['triangles']}, {facts['emissive_triangles']} of them emit{instanced}")
     _list(
         "prototypes",
         [f"{p['instances']} instances of {p['triangles']} triangles  {p['name']}" for p in facts["prototypes"]],
-        most,
+        max_lines,
     )
     _row("bounds", f"({_numbers(lower)}) to ({_numbers(upper)})")
-    _list("lights", _light_lines(facts), most)
-    _list("mesh lights", _mesh_light_lines(facts), most)
-    _list("materials", _material_lines(facts), most)
+    _list("lights", _light_lines(facts), max_lines)
+    _list("mesh lights", _mesh_light_lines(facts), max_lines)
+    _list("materials", _material_lines(facts), max_lines)
     _row(
         "costs", f"{cost['load_seconds']:.2g} s to load, about {_bytes(cost['scene_bytes'])} of memory: {_parts(cost)}"
     )
-    _list("skipped", [f"{value} {key.replace('_', ' ')}" for key, value in facts["skipped"].items()], most)
-    _list("guessed", [f"{key}: {value}" for key, value in facts["guessed"].items()], most)
+    _list("skipped", [f"{value} {key.replace('_', ' ')}" for key, value in facts["skipped"].items()], max_lines)
+    _list("guessed", [f"{key}: {value}" for key, value in facts["guessed"].items()], max_lines)
     counts = {key.replace("_", " "): value for key, value in facts["counts"].items() if value}
     _list("counts", [f"{value:9} {key}" for key, value in counts.items()], math.inf)
 
 
 def _print_list(facts: dict[str, Any], what: str) -> None:
-    """One thing a line, nothing else."""
+    """Prints one camera, light, material or settings prim per line, and nothing else."""
     lines = {
         "cameras": facts["cameras"],
         "lights": _light_lines(facts),
@@ -223,17 +236,17 @@ def _print_list(facts: dict[str, Any], what: str) -> None:
 
 def _light_lines(facts: dict[str, Any]) -> list[str]:
     return [
-        f"{light['kind']:9} {_EMITS[light['kind']]} ({_numbers(light['radiance'])}){_said(light)}  {light['name']}"
-        for light in facts["lights"]
+        f"{x['kind']:9} {_QUANTITY[x['kind']]} ({_numbers(x['radiance'])}){_light_details(x)}  {x['name']}"
+        for x in facts["lights"]
     ]
 
 
 def _mesh_light_lines(facts: dict[str, Any]) -> list[str]:
-    return [f"radiance ({_numbers(x['radiance'])}){_said(x)}  {x['name']}" for x in facts["mesh_lights"]]
+    return [f"radiance ({_numbers(x['radiance'])}){_light_details(x)}  {x['name']}" for x in facts["mesh_lights"]]
 
 
-def _said(light: dict[str, Any]) -> str:
-    """What there is beyond a radiance, in a few words."""
+def _light_details(light: dict[str, Any]) -> str:
+    """Texture, shaping, shadows and links of a light as a short text."""
     width, height = light.get("texture") or (0, 0)
     words = [f"texture {width} x {height}"] if width else []
     words += ["shaped"] if light["shaping"] else []
@@ -244,18 +257,19 @@ def _said(light: dict[str, Any]) -> str:
 
 
 def _parts(cost: dict[str, Any]) -> str:
+    """The memory of each part of the scene as a short text."""
     return ", ".join(f"{name} {_bytes(size)}" for name, size in cost["bytes"].items() if size)
 
 
 def _material_lines(facts: dict[str, Any]) -> list[str]:
     return [
-        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}{_beyond(m)}  {m['name'] or '(default)'}"
+        f"albedo ({_numbers(m['albedo'])}){_emission(m['emission'])}{_material_details(m)}  {m['name'] or '(default)'}"
         for m in facts["materials"]
     ]
 
 
-def _beyond(material: dict[str, Any]) -> str:
-    """What there is to a material beyond its colours, in a few words."""
+def _material_details(material: dict[str, Any]) -> str:
+    """Opacity and textures of a material as a short text."""
     words = []
     if material["cutoff"] > 0.0:
         words.append(f"cut out below opacity {material['cutoff']:.4g}")
@@ -266,18 +280,18 @@ def _beyond(material: dict[str, Any]) -> str:
 
 
 def _settings_lines(facts: dict[str, Any]) -> list[str]:
-    """The render settings that are used, with what their products ask for; then those that are not."""
-    found = facts["render_settings"]
+    """The render settings that are used, with the requests of their products; then those that are not used."""
+    settings = facts["render_settings"]
     lines = []
-    for product in found["products"]:
-        wants = ", ".join(f"{name} {_plain(value)}" for name, value in product["settings"].items())
+    for product in settings["products"]:
+        requests = ", ".join(f"{name} {_plain(value)}" for name, value in product["settings"].items())
         aovs = f", variables {' '.join(product['aovs'])}" if product["aovs"] else ""
         name = f"{product['name']}  " if product["name"] else ""
-        lines.append(f"{name}{product['path'] or found['used']}: {wants}{aovs}")
-    return lines + [f"{path}: not used" for path in found["all"] if path != found["used"]]
+        lines.append(f"{name}{product['path'] or settings['used']}: {requests}{aovs}")
+    return lines + [f"{path}: not used" for path in settings["all"] if path != settings["used"]]
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     return _numbers(list(value)) if isinstance(value, tuple) else str(value)
 
 
@@ -289,8 +303,8 @@ def _bytes(count: float) -> str:
     return f"{count:.3g} GiB"
 
 
-_EMITS = {kind.name.lower(): "radiance" for kind in LightKind} | {"point": "intensity"}
-"""What the three numbers of a light are."""
+_QUANTITY = {kind.name.lower(): "radiance" for kind in LightKind} | {"point": "intensity"}
+"""The quantity that the three numbers of a light are, by its kind."""
 
 
 def _emission(emission: list[float]) -> str:
@@ -305,11 +319,11 @@ def _row(name: str, text: object) -> None:
     print(f"{name:14} {text}")
 
 
-def _list(name: str, lines: list[str], most: float) -> None:
-    """The lines under one name; beyond `most` only their number."""
+def _list(name: str, lines: list[str], max_lines: float) -> None:
+    """Prints the lines under one name: at most `max_lines`, then the number of the others."""
     if not lines:
         return
-    shown = lines if len(lines) <= most else lines[: int(most)]
+    shown = lines if len(lines) <= max_lines else lines[: int(max_lines)]
     _row(name, shown[0] if len(lines) == 1 else len(lines))
     for line in shown if len(lines) > 1 else []:
         print(f"{'':14} {line}")

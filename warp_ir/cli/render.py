@@ -1,4 +1,4 @@
-"""`warp-ir render`: stage in, picture out."""
+"""`warp-ir render`: renders a stage to one picture or to several."""
 
 import argparse
 import json
@@ -11,63 +11,70 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
-from warp_ir.cli.checkpoint import Checkpoint, fingerprint, path_of
+from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
 from warp_ir.cli.device_choice import open_device
-from warp_ir.cli.frames import Moment, outputs_of, time_codes
+from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
-from warp_ir.cli.stage_options import moment_of, open_reader
+from warp_ir.cli.stage_options import open_reader, time_code_of
 from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
 from warp_ir.image.tonemap import suggest_exposure
-from warp_ir.scene import InputError
+from warp_ir.scene import InputError, Scene
+
+if TYPE_CHECKING:
+    from warp_ir.film import Film
+    from warp_ir.renderer import Renderer
+    from warp_ir.scheduling import Progress
+    from warp_ir.usd import StageReader
+    from warp_ir.usd.settings.render_spec import Product
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """One render, and the files that are written of it."""
+    """One render and the files that it is written to."""
 
-    when: Moment
-    product: Any
-    """The `Product` of the stage whose camera and settings count; None: the first."""
+    time: TimeCode
+    product: "Product | None"
+    """RenderProduct whose camera and settings are used; None: the first of the stage."""
     files: Mapping[Path, tuple[str, ...] | None]
-    """The AOVs of each; None: those of the product."""
+    """File -> its AOVs; None: those of the first product."""
 
 
 @dataclass
 class _Job:
-    """What all pictures share."""
+    """What all pictures of a command share."""
 
     args: argparse.Namespace
     device: str
     versions: Mapping[str, str]
-    reader: Any
-    renderer: Any = None
-    before: Any = None
-    """The scene of the picture before."""
+    reader: "StageReader"
+    renderer: "Renderer | None" = None
+    previous_scene: Scene | None = None
     warned: set[str] = field(default_factory=set)
+    """Warnings that have been printed."""
 
 
 def run(args: argparse.Namespace) -> int:
-    """Renders the stage's picture, or one for each of the frames; the exit code."""
+    """Renders the stage's picture, or one for each frame and product; returns the exit code."""
     begin = time.perf_counter()
-    # Everything that can be wrong with the command line is found before anything is loaded.
+    # All errors of the command line are reported before anything is loaded.
     settings_of(args)
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     if not into_folder:
-        outputs = outputs_of(args.output, args.frames, moment_of(args))
-        pictures = [_Picture(when, None, {path: None}) for when, path in outputs.items()]
+        outputs = outputs_of(args.output, args.frames, time_code_of(args))
+        pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
         for path in outputs.values():
             check_output(path, make_folder=args.make_output_path)
     if args.stats:
         check_output(args.stats, (".json",), make_folder=args.make_output_path)
     device = open_device(args.device, verbose=args.verbose)
     with importing():
-        _ = ir.load_usd, ir.Renderer  # imported here, so that their time is not the first frame's
+        _ = ir.load_usd, ir.Renderer  # imported here, so that the first frame's time does not include it
     versions = _versions()
     imported = time.perf_counter() - begin
     with ProgressDisplay("opening", quiet=args.quiet):
@@ -81,14 +88,14 @@ def run(args: argparse.Namespace) -> int:
     code = 0
     for number, picture in enumerate(pictures, start=1):
         path = next(iter(picture.files))
-        if args.resume and all(file.exists() for file in picture.files) and not path_of(path).exists():
-            say(f"{path}: is there already")
+        if args.resume and all(file.exists() for file in picture.files) and not checkpoint_path(path).exists():
+            say(f"{path}: exists and is skipped")
             continue
         label = path.name if len(pictures) == 1 else f"{path.name} ({number}/{len(pictures)})"
-        record, code = _render_picture(job, picture, label)
+        statistics, code = _render_picture(job, picture, label)
         if not frames:
-            record["timings"]["load"] += opened
-        frames.append(record)
+            statistics["timings"]["load"] += opened
+        frames.append(statistics)
         if code:
             break
     if args.stats:
@@ -97,50 +104,59 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _products(job: _Job) -> list[_Picture]:
-    """The pictures that the stage's products ask for, in the user's folder; those that differ in name alone are one."""
+    """The pictures that the stage's RenderProducts ask for, in the user's folder.
+
+    Products with the same camera and settings are one render that is written to several files.
+
+    Raises:
+        InputError: The stage has no RenderProducts, or two of them have the same file name.
+    """
     args, pictures, taken = job.args, [], set()
     folder = Path(args.output)
-    codes: list[Moment] = list(time_codes(args.frames)) if args.frames else [moment_of(args)]
-    for when in codes:
-        groups: list[tuple[Any, dict[Path, tuple[str, ...] | None]]] = []
-        for product in job.reader.spec(when).products:
+    codes: list[TimeCode] = list(time_codes(args.frames)) if args.frames else [time_code_of(args)]
+    for code in codes:
+        groups: list[tuple[Product, dict[Path, tuple[str, ...] | None]]] = []
+        for product in job.reader.spec(code).products:
             if not product.path:
                 raise InputError(
-                    f"{folder}: is a folder, and {args.stage} has no RenderProducts; name the file to write"
+                    f"{folder}: is a folder, but {args.stage} has no RenderProducts; name the file to write"
                 )
             name = Path(product.name)
             if name.suffix.lower() not in SUFFIXES:
-                say(f"warning: {product.path}: pictures of kind {name.suffix!r} are not written; .exr is")
+                say(f"warning: {product.path}: files of type {name.suffix!r} cannot be written; .exr is used")
                 name = name.with_suffix(".exr")
             if args.frames and "#" not in str(name) and folder / name in taken:
                 name = name.with_name(f"{name.stem}.####{name.suffix}")
             if args.frames and "#" in str(name):
-                assert isinstance(when, float)
-                name = outputs_of(str(name), f"{when:g}", None)[when]
+                assert isinstance(code, float)
+                name = outputs_of(str(name), f"{code:g}", None)[code]
             path = check_output(folder / name, make_folder=args.make_output_path)
             if path in taken:
-                raise InputError(f"{product.path}: another picture is called {name} as well")
+                raise InputError(f"{product.path}: another RenderProduct is also written to {name}")
             taken.add(path)
-            alike = (g for g in groups if (g[0].camera, g[0].settings) == (product.camera, product.settings))
-            group = next(alike, None)
+            same = (g for g in groups if (g[0].camera, g[0].settings) == (product.camera, product.settings))
+            group = next(same, None)
             if group is None:
                 group = (product, {})
                 groups.append(group)
             group[1][path] = product.aovs
-        pictures += [_Picture(when, product, files) for product, files in groups]
+        pictures += [_Picture(code, product, files) for product, files in groups]
     return pictures
 
 
 def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str, Any], int]:
-    """Loads, renders and writes one picture; its statistics and the exit code."""
+    """Loads, renders and writes one picture; returns its statistics and the exit code."""
     args = job.args
     path = next(iter(picture.files))
     with ProgressDisplay(label, quiet=args.quiet) as display:
         begin = time.perf_counter()
-        scene = job.reader.read(picture.when, picture.product)
-        loaded = time.perf_counter() - begin
-        kept = {name: _kept(getattr(job.before, name, ()), getattr(scene, name)) for name in ("meshes", "lights")}
-        job.before = scene
+        scene = job.reader.read(picture.time, picture.product)
+        load_seconds = time.perf_counter() - begin
+        reused = {
+            name: _count_reused(getattr(job.previous_scene, name, ()), getattr(scene, name))
+            for name in ("meshes", "lights")
+        }
+        job.previous_scene = scene
         if not args.quiet:
             say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
             job.warned.update(scene.warnings)
@@ -152,44 +168,51 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         renderer, film = job.renderer, job.renderer.new_film()
         checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint)
         if args.resume and checkpoint.resume():
-            say(f"{path}: goes on after {film.iterations} iterations")
+            say(f"{path}: continues after {film.iterations} iterations")
 
-        def progress(report: Any) -> None:
-            display(report)
-            if report.fraction < 1.0:
-                checkpoint.maybe()
+        def report(progress: "Progress") -> None:
+            display(progress)
+            if progress.fraction < 1.0:
+                checkpoint.write_if_due()
 
-        renderer.render(film, progress)
-    timings = {**film.timings, "load": loaded}
-    # The renderer tells which signal stopped it; a mere True stands for Ctrl-C.
-    stopped = int(film.interrupted)
-    code = 128 + (stopped if stopped > 1 else signal.SIGINT) if stopped else 0
+        renderer.render(film, report)
+    timings = {**film.timings, "load": load_seconds}
+    # `Film.interrupted` is the number of the signal; True stands for Ctrl-C.
+    stop_signal = int(film.interrupted)
+    code = 128 + (stop_signal if stop_signal > 1 else signal.SIGINT) if stop_signal else 0
     written: list[Path] = []
-    if film.iterations or not stopped:
+    if film.iterations or not stop_signal:
         begin = time.perf_counter()
-        facts = {**job.versions, "stage": str(args.stage), "camera": scene.camera.name, "device": job.device}
+        metadata: dict[str, object] = {
+            **job.versions,
+            "stage": str(args.stage),
+            "camera": scene.camera.name,
+            "device": job.device,
+        }
+        if picture.time is not None:
+            metadata["frame"] = picture.time
         for file, aovs in picture.files.items():
             written += write_image(
                 file,
                 film,
-                aovs=_aovs(args, job.reader.spec(picture.when).products[0].aovs if aovs is None else aovs, file),
+                aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
                 exposure=args.exposure,
                 tonemap=args.tonemap,
                 half=args.half,
-                metadata=facts if picture.when is None else {**facts, "frame": picture.when},
+                metadata=metadata,
             )
         timings["write"] = time.perf_counter() - begin
-    if not stopped:
+    if not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
-        say(f"{checkpoint.path}: from here --resume goes on")
-    unseen = _unseen(scene, film)
-    if unseen and not args.quiet:
-        say_warnings(unseen)
+        say(f"{checkpoint.path}: --resume continues from this checkpoint")
+    blank = _blank_picture(scene, film)
+    if blank and not args.quiet:
+        say_warnings(blank)
     _summarize(job, path, film, bool(written))
-    record = {
+    statistics = {
         "output": [str(file) for file in written],
-        "frame": picture.when,
+        "frame": picture.time,
         "camera": scene.camera.name,
         "width": film.width,
         "height": film.height,
@@ -197,40 +220,40 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         "seconds": film.seconds,
         "error": film.error(),
         "rejected": film.rejected,
-        "interrupted": bool(stopped),
+        "interrupted": bool(stop_signal),
         "timings": timings,
         "settings": renderer.settings.to_dict(),
         "loaded": dict(scene.stats),
-        "kept": kept,
+        "kept": reused,
         "counts": dict(film.counts),
-        "warnings": [*scene.warnings, *unseen],
+        "warnings": [*scene.warnings, *blank],
     }
-    return record, code
+    return statistics, code
 
 
-def _unseen(scene: Any, film: Any) -> list[str]:
-    """The warning that a picture shows no geometry, where nothing has said so before."""
-    said = any("all geometry" in line or "draws no geometry" in line for line in scene.warnings)
-    if said or not film.iterations or film.aov("alpha").max() > 0.0:
+def _blank_picture(scene: Scene, film: "Film") -> list[str]:
+    """The warning that a picture shows no geometry, unless a warning of the scene explains it already."""
+    explained = any("all geometry" in line or "draws no geometry" in line for line in scene.warnings)
+    if explained or not film.iterations or film.aov("alpha").max() > 0.0:
         return []
     return [f"{scene.camera.name}: the camera sees no geometry"]
 
 
-def _kept(before: Sequence[Any], now: Sequence[Any]) -> int:
-    """How many of the records are those of the picture before."""
-    there = {id(item) for item in before}
-    return sum(id(item) in there for item in now)
+def _count_reused(previous: Sequence[object], current: Sequence[object]) -> int:
+    """How many of the current records are the same objects as in the previous picture."""
+    ids = {id(item) for item in previous}
+    return sum(id(item) in ids for item in current)
 
 
-def _aovs(args: argparse.Namespace, wanted: Sequence[str], path: Path) -> tuple[str, ...]:
-    """The AOVs to write: the user's, else the stage's if the format has layers for them."""
+def _aovs(args: argparse.Namespace, from_stage: Sequence[str], path: Path) -> tuple[str, ...]:
+    """The AOVs to write: those of the command line, else those of the stage if the format has layers."""
     if args.aovs or path.suffix.lower() != ".exr":
         return tuple(dict.fromkeys(args.aovs))
-    return tuple(name for name in wanted if name != "alpha")  # which every .exr has
+    return tuple(name for name in from_stage if name != "alpha")  # every .exr has alpha
 
 
-def _summarize(job: _Job, path: Path, film: Any, written: bool) -> None:
-    """The line at the end, and what the user should know of the picture."""
+def _summarize(job: _Job, path: Path, film: "Film", written: bool) -> None:
+    """Prints the line about a finished picture, and warnings and hints about its values."""
     if film.interrupted:
         say("interrupted" if written else "interrupted before the first iteration: nothing written")
     if not written or job.args.quiet:
@@ -247,30 +270,30 @@ def _summarize(job: _Job, path: Path, film: Any, written: bool) -> None:
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
-            what = "dark" if stops > job.args.exposure else "bright"
-            say(f"hint: the picture is very {what}; --exposure {stops:g} would show it properly")
+            brightness = "dark" if stops > job.args.exposure else "bright"
+            say(f"hint: the picture is very {brightness}; --exposure {stops:g} would correct this")
 
 
 def _write_stats(path: Path, job: _Job, imported: float, frames: list[dict[str, Any]]) -> None:
-    """All numbers of the run as JSON; those of a single picture are not in a list."""
-    shared: dict[str, Any] = {
+    """Writes the statistics of all pictures as JSON: as a list `frames`, or at the top level for a single picture."""
+    results: dict[str, Any] = {
         "stage": str(job.args.stage),
         "device": job.device,
         "versions": dict(job.versions),
         "peak_memory_bytes": _peak_memory(),
     }
     if job.args.frames is None and len(frames) == 1:
-        frame = dict(frames[0])
-        frame["timings"] = {"import": imported, **frame["timings"]}
-        shared |= frame
+        statistics = dict(frames[0])
+        statistics["timings"] = {"import": imported, **statistics["timings"]}
+        results |= statistics
     else:
-        shared |= {"timings": {"import": imported}, "frames": frames}
+        results |= {"timings": {"import": imported}, "frames": frames}
     with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(_plain(shared), indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(_plain(results), indent=2) + "\n", encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """The value in JSON's terms: NumPy numbers as Python's, and null for what is not finite."""
+def _plain(value: object) -> object:
+    """The value as JSON can hold it: NumPy numbers become Python's, and numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -280,7 +303,7 @@ def _plain(value: Any) -> Any:
 
 
 def _versions() -> dict[str, str]:
-    """Versions of what decides the pixels."""
+    """Versions of the packages that the pixels depend on."""
     import numpy as np
     import warp as wp
     from pxr import Usd
@@ -295,7 +318,7 @@ def _versions() -> dict[str, str]:
 
 
 def _peak_memory() -> int | None:
-    """Most memory the process has held [bytes], where the system tells."""
+    """Peak resident memory of the process [bytes]; None where the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows

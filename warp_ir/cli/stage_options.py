@@ -1,16 +1,22 @@
-"""The stage that a command is about: the scene in it, and what only the stage itself knows."""
+"""Opens the stage that a command works on, and reads what the `Scene` does not hold of it."""
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from warp_ir.cli.frames import TimeCode
 from warp_ir.cli.import_guard import importing
 
+if TYPE_CHECKING:
+    from pxr import Usd
 
-def open_reader(args: argparse.Namespace) -> Any:
-    """The `StageReader` that the flags of the group "stage" want.
+    from warp_ir.usd import StageReader
+
+
+def open_reader(args: argparse.Namespace) -> "StageReader":
+    """Opens the stage as the flags of the group "stage" say.
 
     Raises:
-        InputError: The stage cannot be opened.
+        InputError: The stage cannot be opened, or a flag does not fit it.
     """
     with importing():
         from warp_ir.usd.load import StageReader
@@ -35,17 +41,17 @@ def open_reader(args: argparse.Namespace) -> Any:
     )
 
 
-def moment_of(args: argparse.Namespace) -> float | str | None:
-    """The moment that the flags want, of a single picture."""
+def time_code_of(args: argparse.Namespace) -> TimeCode:
+    """The time code of a single picture that the flags ask for."""
     return "default" if args.default_time else args.time
 
 
-def stage_facts(reader: Any, moment: float | str | None = None) -> dict[str, Any]:
-    """Axis, unit, frames, cameras and settings: what a renderer does not need to know, and a user might.
+def stage_facts(reader: "StageReader", time: TimeCode = None) -> dict[str, Any]:
+    """Up axis, unit, frames, cameras and render settings of a stage, as plain values for JSON.
 
     Args:
-        reader: A `StageReader`.
-        moment: What is shown, as for its `read`.
+        reader: Reader of the stage.
+        time: Time code at which the render settings are read.
     """
     from pxr import UsdRender
 
@@ -56,11 +62,11 @@ def stage_facts(reader: Any, moment: float | str | None = None) -> dict[str, Any
 
     stage = reader.stage
     with quiet():
-        spec = reader.spec(moment)
-        code = time_code(stage, moment)
+        spec = reader.spec(time)
+        code = time_code(stage, time)
         frames = [stage.GetStartTimeCode(), stage.GetEndTimeCode()] if stage.HasAuthoredTimeCodeRange() else None
         return {
-            "up_axis": up_axis(stage, Report(reader.source)),  # what it says, the reader has said
+            "up_axis": up_axis(stage, Report(reader.source)),  # the reader has already reported its warnings
             "meters_per_unit": _meters_per_unit(stage),
             "frames": frames,
             "time": None if code.IsDefault() else code.GetValue(),
@@ -86,8 +92,8 @@ def stage_facts(reader: Any, moment: float | str | None = None) -> dict[str, Any
         }
 
 
-def _meters_per_unit(stage: Any) -> float:
-    """Of the stage's metadata, which files also hold as another type: USD refuses those."""
+def _meters_per_unit(stage: "Usd.Stage") -> float:
+    """The stage's metersPerUnit. USD raises an error where a file stores it with an unexpected type."""
     from pxr import Tf, UsdGeom
 
     try:

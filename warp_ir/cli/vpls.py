@@ -1,30 +1,36 @@
-"""`warp-ir vpls`: the virtual point lights as a picture, as points of a USD stage, or as arrays."""
+"""`warp-ir vpls`: writes the virtual point lights as a picture, as points of a USD stage, or as arrays."""
 
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.console import muted_stderr, say, say_warnings
 from warp_ir.cli.device_choice import open_device
-from warp_ir.cli.stage_options import moment_of, open_reader, stage_facts
+from warp_ir.cli.stage_options import open_reader, stage_facts, time_code_of
 from warp_ir.image.io import check_output, whole_file
 from warp_ir.scene import InputError, Scene
 
+if TYPE_CHECKING:
+    from pxr import Vt
+
+    from warp_ir.vpl.emission import Vpls
+
 
 def run(args: argparse.Namespace) -> int:
-    """Traces one iteration's light paths and writes where they went; the exit code."""
+    """Traces the light paths of one iteration and writes their VPLs; returns the exit code."""
     if args.iteration < 0:
         raise InputError(f"--iteration: must be at least 0, is {args.iteration}")
     settings = settings_of(args)
     path = check_output(args.output, (".png", ".usda", ".npz"), make_folder=args.make_output_path)
     device = open_device(args.device, verbose=args.verbose)
     reader = open_reader(args)
-    scene = reader.read(moment_of(args))
+    scene = reader.read(time_code_of(args))
     if not args.quiet:
         say_warnings(scene.warnings, everything=args.verbose)
     vpls = ir.trace_vpls(scene, settings, device=device, iteration=args.iteration)
@@ -40,24 +46,31 @@ def run(args: argparse.Namespace) -> int:
             picture_vpls(scene, vpls, path, view=args.view, width=settings.width, height=settings.height)
     if not args.quiet:
         directional = int(np.count_nonzero(vpls.directional))
-        sky = f", {directional} of them directional" if directional else ""
-        print(f"{path}: {len(vpls.positions)} VPLs{sky}")
+        addition = f", {directional} of them directional" if directional else ""
+        print(f"{path}: {len(vpls.positions)} VPLs{addition}")
         if directional and suffix == ".usda":
             say(f"{directional} directional VPLs (sun and sky) have no position and are left out")
     return 0
 
 
-def _write_arrays(path: Path, vpls: Any) -> None:
+def _write_arrays(path: Path, vpls: "Vpls") -> None:
     names = ("positions", "normals", "intensity", "bounce", "directional")
     with whole_file(path) as temporary:
         np.savez_compressed(temporary, **{name: getattr(vpls, name) for name in names})
 
 
-def write_points(path: Path, scene: Scene, vpls: Any, stage: Mapping[str, Any]) -> None:
-    """The VPLs at a finite place as UsdGeom.Points: coloured as they shine, the brighter the wider.
+def write_points(path: Path, scene: Scene, vpls: "Vpls", facts: Mapping[str, Any]) -> None:
+    """Writes the VPLs that have a position as UsdGeom.Points.
 
-    Primvars keep the exact `intensity` [W sr⁻¹] and `bounce`. Positions are in world space, in the unit
-    and up axis of the stage (`up_axis` and `meters_per_unit`), so that the file can be layered over it.
+    displayColor is the colour of the intensity, and widths grow with its square root. Primvars hold the exact
+    `intensity` [W sr⁻¹] and `bounce`. Positions are in world space, with the unit and the up axis of the stage, so that
+    the file can be layered over it.
+
+    Args:
+        path: The .usda file.
+        scene: The scene of the VPLs.
+        vpls: The VPLs.
+        facts: `stage_facts` of the stage; `up_axis` and `meters_per_unit` are used.
     """
     from pxr import Sdf, Usd, UsdGeom, Vt
 
@@ -67,12 +80,12 @@ def write_points(path: Path, scene: Scene, vpls: Any, stage: Mapping[str, Any]) 
     relative = peak / max(float(peak.max(initial=0.0)), 1e-300)
     widths = 0.02 * (scene.extent or 1.0) * np.clip(np.sqrt(relative), 0.1, 1.0)
 
-    def vectors(values: Any) -> Any:
+    def vectors(values: npt.NDArray[Any]) -> "Vt.Vec3fArray":
         return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
     out = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(out, stage["up_axis"])
-    UsdGeom.SetStageMetersPerUnit(out, stage["meters_per_unit"])
+    UsdGeom.SetStageUpAxis(out, facts["up_axis"])
+    UsdGeom.SetStageMetersPerUnit(out, facts["meters_per_unit"])
     points = UsdGeom.Points.Define(out, "/VPLs")
     out.SetDefaultPrim(points.GetPrim())
     out.SetMetadata("comment", f"virtual point lights of {scene.name}")
