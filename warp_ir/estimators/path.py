@@ -48,7 +48,7 @@ def _reflected(
     at_point = wp.dot(shading_normal, light.direction)
     if at_point <= 0.0 or wp.max(light.radiance) <= 0.0 or wp.dot(normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    arrives = light_visibility(scene, light.modifiers, position, mesh, seen, light.target)
+    arrives = light_visibility(scene, light.modifier_row, position, mesh, seen, light.target)
     if wp.max(arrives) <= 0.0:
         return wp.vec3(0.0)
     # The two ways to find this light are weighted by their densities; a delta light has only one (density 0).

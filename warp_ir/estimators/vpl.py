@@ -107,7 +107,7 @@ def _gather_pixels(
         x = _first_receiver(gbuffer, pixel)
         throughput = wp.vec3(1.0)
         bound = parts[ON_LIGHTS].bound  # the same for both
-        reach = 1.0 / wp.sqrt(bound.least)
+        reach = 1.0 / wp.sqrt(bound.minimum)
         depth = int(0)
         rays = settings.rays
         while depth <= settings.max_bounces:
@@ -134,7 +134,7 @@ def _gather_pixels(
             cut = float(0.0)
             if hit.triangle >= 0:
                 g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-                cut = clamped_fraction(bound.least, g)
+                cut = clamped_fraction(bound.minimum, g)
                 if cut > 0.0:
                     found += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
             found = wp.cw_mul(throughput, found) * wp.pi

@@ -52,7 +52,7 @@ def learn_photon_target(scene: DeviceScene, seen: CameraProbes, launcher: Launch
     if before <= WORTH * after:
         return None
     photon_target = PhotonTarget()
-    photon_target.rings = _RINGS
+    photon_target.annulus_count = _RINGS
     photon_target.focus = launcher.array(focus, wp.vec4)
     photon_target.cdf = launcher.array(np.pad(cdf / cdf[:, -1:], ((0, 0), (1, 0))).reshape(-1), wp.float32)
     return photon_target

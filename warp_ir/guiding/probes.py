@@ -85,7 +85,7 @@ def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scrambl
             found.weight[row] = (throughput[0] + throughput[1] + throughput[2]) * (1.0 / 3.0)
             cosine = wp.dot(shading_normal, light.direction)
             if cosine > 0.0 and wp.dot(normal, light.direction) > 0.0 and wp.max(light.radiance) > 0.0:
-                arrives = light_visibility(scene, light.modifiers, position, mesh, k == 0, light.target)
+                arrives = light_visibility(scene, light.modifier_row, position, mesh, k == 0, light.target)
                 gives = wp.cw_mul(throughput, wp.cw_mul(light.radiance, arrives)) * (cosine / wp.pi)
                 found.score[row] = (gives[0] + gives[1] + gives[2]) * (1.0 / 3.0)
 

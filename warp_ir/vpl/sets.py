@@ -72,7 +72,7 @@ def bound_of(lit: VplSets, vpl: int, normal: wp.vec4) -> float:
         return UNBOUNDED
     if vpl < lit.vpls.on_lights:
         return bound_for_pdf(lit.bound, lit.vpls.pdf_area[vpl])
-    return lit.bound.least
+    return lit.bound.minimum
 
 
 @wp.func
@@ -115,9 +115,9 @@ def _with(lit: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
 def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
     """The bound where a pixel weighs so many VPLs, so many of them on lights; `build_sets` knows the rest."""
     out = Bound()
-    out.least = UNBOUNDED
+    out.minimum = UNBOUNDED
     if area > wp.float64(0.0):
-        out.least = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
+        out.minimum = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
     out.per_pdf_area = float(_PI * wp.float64(on_lights) / _AREAS)
     return out
 
@@ -209,7 +209,7 @@ def _pack_shaping(first: int, scene: SceneData, parts: wp.array[VplSets]) -> Non
             if row >= 0:
                 modifiers = scene.light_tables[0].modifiers.rows[row]
                 axis = wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2])
-                ramp = wp.vec4(modifiers.slope, modifiers.offset, modifiers.least, modifiers.cutoff)
+                ramp = wp.vec4(modifiers.ramp_slope, modifiers.ramp_offset, modifiers.ramp_min, modifiers.cutoff_cosine)
         for k in range(3):
             lit.shapes[SHAPING_ROWS * i + k][lane] = axis[k]
         for k in range(4):
