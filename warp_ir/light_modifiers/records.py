@@ -24,7 +24,7 @@ class LightModifiers:
     ramp_offset: float
     ramp_min: float
     cutoff_cosine: float  # cosine to the axis below which the light is dark
-    shadows: int  # 0: its direct light is not shadowed where the camera sees it
+    shadows: int  # 0: where the camera sees its direct light, nothing shadows it
     unlit: int  # row of the link table: the meshes it does not illuminate; -1: none
     shadowless: int  # row of the link table: the meshes that do not shadow its light; -1: none
 

@@ -91,6 +91,7 @@ def sample_cell(tables: Distribution2DTables, index: int, u: wp.vec2) -> CellSam
 
 @wp.func
 def _cell_probability(tables: Distribution2DTables, distribution: Distribution2D, row: int, column: int) -> float:
+    """The probability of sampling a cell."""
     first = distribution.cdf + distribution.rows + 1 + row * (distribution.columns + 1) + column
     row_probability = tables.cdf[distribution.cdf + row + 1] - tables.cdf[distribution.cdf + row]
     return row_probability * (tables.cdf[first + 1] - tables.cdf[first])
@@ -106,17 +107,17 @@ def _versine(theta: float) -> float:
 @wp.func
 def _cell_solid_angle(distribution: Distribution2D, row: int) -> float:
     """Solid angle [sr] of one cell of a row."""
-    band = distribution.max_theta / float(distribution.rows)
-    bands = _versine(band * float(row + 1)) - _versine(band * float(row))
-    return bands * 2.0 * wp.pi / float(distribution.columns)
+    row_angle = distribution.max_theta / float(distribution.rows)
+    height = _versine(row_angle * float(row + 1)) - _versine(row_angle * float(row))
+    return height * 2.0 * wp.pi / float(distribution.columns)
 
 
 @wp.func(inline=False)
 def cell_direction(tables: Distribution2DTables, index: int, cell: CellSample) -> wp.vec4:
     """The unit direction around +z of a sample in a cell, and its pdf per solid angle."""
     distribution = tables.distributions[index]
-    band = distribution.max_theta / float(distribution.rows)
-    h = wp.lerp(_versine(band * float(cell.row)), _versine(band * float(cell.row + 1)), cell.y)
+    row_angle = distribution.max_theta / float(distribution.rows)
+    h = wp.lerp(_versine(row_angle * float(cell.row)), _versine(row_angle * float(cell.row + 1)), cell.y)
     r = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
     phi = 2.0 * wp.pi * (float(cell.column) + cell.x) / float(distribution.columns)
     return wp.vec4(
@@ -148,7 +149,7 @@ def direction_pdf(tables: Distribution2DTables, index: int, d: wp.vec3) -> float
 
 @wp.func(inline=False)
 def uv_pdf(tables: Distribution2DTables, index: int, uv: wp.vec2) -> float:
-    """The pdf of samples of a rectangle at uv coordinates in [0, 1]², with respect to du dv."""
+    """The pdf per du dv of the samples of a rectangle at uv coordinates in [0, 1]²."""
     distribution = tables.distributions[index]
     row = wp.clamp(int(uv[1] * float(distribution.rows)), 0, distribution.rows - 1)
     column = wp.clamp(int(uv[0] * float(distribution.columns)), 0, distribution.columns - 1)
@@ -167,6 +168,7 @@ def cell_uv(tables: Distribution2DTables, index: int, cell: CellSample) -> wp.ve
 
 @wp.func
 def _texel(tables: Distribution2DTables, distribution: Distribution2D, row: int, column: int) -> wp.vec3:
+    """The value of a cell; outside the table that of the nearest cell."""
     r = wp.clamp(row, 0, distribution.rows - 1)
     c = wp.clamp(column, 0, distribution.columns - 1)
     if distribution.max_theta > 0.0:  # the azimuth is periodic

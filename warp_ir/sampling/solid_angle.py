@@ -45,6 +45,7 @@ class _CanonicalSpace:
 
 @wp.func
 def _canonical_space(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3) -> _CanonicalSpace:
+    """The canonical space of a light; arguments as for `sample_solid_angle`."""
     x = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
     y = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
     z = wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2])
@@ -118,6 +119,7 @@ def _one_minus_cos_radius(centre: wp.vec3) -> float:
 
 @wp.func
 def _sample_sphere(centre: wp.vec3, u: wp.vec2) -> DirectionSample:
+    """A direction uniform in the cone that the unit sphere around `centre` subtends."""
     out = DirectionSample()
     squared = wp.dot(centre, centre)
     if not squared > 1.0:
@@ -138,6 +140,7 @@ def _sample_sphere(centre: wp.vec3, u: wp.vec2) -> DirectionSample:
 
 @wp.func
 def _sphere_pdf(centre: wp.vec3) -> float:
+    """The pdf of `_sample_sphere`, the same for all its directions."""
     if not wp.dot(centre, centre) > 1.0:
         return 0.0
     return 1.0 / (2.0 * wp.pi * _one_minus_cos_radius(centre))
@@ -179,6 +182,7 @@ def _area(kind: int, half: wp.vec2) -> float:
 
 @wp.func
 def _sample_flat(kind: int, space: _CanonicalSpace, u: wp.vec2) -> DirectionSample:
+    """A direction towards a rectangle or a disk: by solid angle if it is near, else by area."""
     out = DirectionSample()
     z = -space.centre[2]  # the light shines along +z
     if not z > 0.0:
@@ -213,6 +217,7 @@ def _area_to_solid_angle_pdf(offset: wp.vec3, area: float) -> float:
 
 @wp.func
 def _flat_pdf(kind: int, space: _CanonicalSpace, d: wp.vec3) -> float:
+    """The pdf of `_sample_flat` for a direction that hits the light."""
     z = -space.centre[2]
     if not (z > 0.0 and d[2] < 0.0):
         return 0.0
@@ -274,6 +279,7 @@ def _half_azimuth(centre: wp.vec3) -> float:
 
 @wp.func
 def _sample_cylinder(space: _CanonicalSpace, u: wp.vec2) -> DirectionSample:
+    """A direction towards a cylinder, uniform in the azimuth and in the sine of the elevation."""
     out = DirectionSample()
     centre = space.centre
     half = _half_azimuth(centre)
@@ -297,6 +303,7 @@ def _sample_cylinder(space: _CanonicalSpace, u: wp.vec2) -> DirectionSample:
 
 @wp.func
 def _cylinder_pdf(space: _CanonicalSpace, d: wp.vec3) -> float:
+    """The pdf of `_sample_cylinder` for a direction that hits the light."""
     half = _half_azimuth(space.centre)
     if half == 0.0:
         return 0.0
