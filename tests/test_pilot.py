@@ -98,7 +98,7 @@ def test_noise_is_less(wide, name, gains, device):
 
 
 def test_nothing_changes_where_little_is_gained(device):
-    """In the Cornell box all light matters to the camera: learning changes no bit, and for one lamp nothing is learned."""
+    """In the Cornell box all light matters: learning changes no bit, and for one lamp nothing is learned."""
     how = {"iterations": 2, "width": 64, "height": 64}
     alone = film_of(cornell_box(), device=device, **how)
     assert not any(name in alone.counts for name in GUIDED)

@@ -30,10 +30,10 @@ def _aim(
 ):
     i = first + wp.tid()
     aim = sample_solid_angle(kind, axes, inverse, to_light, u[i])
-    way[i] = aim.way
+    way[i] = aim.offset
     density[0, i] = aim.pdf
     if aim.pdf > 0.0:
-        density[1, i] = solid_angle_pdf(kind, axes, inverse, to_light, wp.normalize(aim.way))
+        density[1, i] = solid_angle_pdf(kind, axes, inverse, to_light, wp.normalize(aim.offset))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_ir.image.mipmap import mip_chain, resized
 from warp_ir.scene import Texture, Wrap
-from warp_ir.texture import TextureTable, coordinates, lookup, mean_on_triangles, mip_level, upload_textures
+from warp_ir.texture import TextureTable, lookup, mean_on_triangles, mip_level, upload_textures, uv_to_st
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,7 +23,7 @@ def _look(
     i = first + wp.tid()
     row = table.rows[0]
     level = mip_level(table, row, uv_per_area, footprint)
-    out[i] = lookup(table, row, coordinates(row, uvs[i]), level)
+    out[i] = lookup(table, row, uv_to_st(row, uvs[i]), level)
 
 
 def look(launcher, texture, uvs, uv_per_area=1.0, footprint=0.0):

@@ -1,13 +1,12 @@
-"""Textures on the device: every image with a chain of means, and one function that looks them up.
+"""Textures on the device: every image as a mip chain, and one function that looks it up.
 
-Each level of the chain has half the pixels a side and keeps the mean exactly. Whoever looks up says how wide the
-patch of surface is that the answer stands for, and gets the level whose pixels are about as wide, interpolated
-between four of them: what is far away, and what light bounces off, costs no more and does not flicker.
+Each level has half the pixels a side and exactly the image's mean. A lookup takes the width of the patch of surface to
+average over (the footprint), and interpolates bilinearly on the level whose pixels are about as wide. Distant surfaces
+and diffuse reflections therefore cost no more than near ones and do not flicker.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,30 +19,30 @@ from warp_ir.scene import Floats, Texture, Wrap
 wp.set_module_options({"enable_backward": False})
 
 MAX_BYTES = 2**30
-"""All textures together: above it, the largest are halved a side until they fit."""
+"""Largest size of all textures together; above it, the largest images are halved a side until they fit."""
 _BLACK = wp.constant(int(Wrap.BLACK))
 _REPEAT = wp.constant(int(Wrap.REPEAT))
 _MIRROR = wp.constant(int(Wrap.MIRROR))
 _WINDOW = 8
-"""Pixels across a triangle when its mean is estimated."""
+"""Most pixels that a triangle spans per axis on the level from which its mean is estimated."""
 _CHUNK = 2**14
-"""Triangles at once, likewise."""
+"""Triangles whose means are estimated at a time, which limits the memory."""
 
 
 @wp.struct
 class TextureRow:
     """One texture."""
 
-    first_level: int
+    first_level: int  # row of `TextureTable.levels`
     level_count: int
     channels: int  # 1 or 3
-    wrap_s: int
+    wrap_s: int  # a `Wrap`
     wrap_t: int
-    uv_set: int
-    scale: float  # what a texel of 1 stands for, a power of two
-    s: wp.vec3  # (uv, 1) · s is the texture's first coordinate
-    t: wp.vec3
-    outside: wp.vec3
+    uv_set: int  # index of the mesh's uv set
+    scale: float  # the value of a texel of 1: a power of two
+    s: wp.vec3  # the texture coordinate s is (u, v, 1) · s
+    t: wp.vec3  # and t is (u, v, 1) · t
+    outside: wp.vec3  # value beyond the edges where the wrap mode is BLACK
 
 
 @wp.struct
@@ -52,13 +51,13 @@ class TextureTable:
 
     count: int
     rows: wp.array[TextureRow]
-    levels: wp.array[wp.vec3i]  # columns, rows, first value in texels
-    texels: wp.array[wp.float16]  # the image's top row first, as everywhere
+    levels: wp.array[wp.vec3i]  # columns, rows, index of the first value in texels
+    texels: wp.array[wp.float16]  # the image's top row first
 
 
 @wp.struct
 class _Neighbours:
-    """Two pixels along one axis, and the weight of the second; -1: outside."""
+    """Two neighbouring pixels along one axis (-1: outside), and the weight of the second."""
 
     a: int
     b: int
@@ -67,18 +66,18 @@ class _Neighbours:
 
 @wp.func
 def _neighbours(x: float, size: int, wrap: int) -> _Neighbours:
-    """The pixels around a coordinate in [0, 1]."""
-    at = float(0.0)
+    """The two pixels around a coordinate; the image covers [0, 1]."""
+    texel = float(0.0)
     if wrap == _REPEAT:
-        at = x - wp.floor(x)
+        texel = x - wp.floor(x)
     elif wrap == _MIRROR:
-        at = wp.abs(x - 2.0 * wp.floor(0.5 * x + 0.5))
+        texel = wp.abs(x - 2.0 * wp.floor(0.5 * x + 0.5))
     else:
-        at = wp.clamp(x, -1.0, 2.0)
-    at = at * float(size) - 0.5
-    low = wp.floor(at)
+        texel = wp.clamp(x, -1.0, 2.0)
+    texel = texel * float(size) - 0.5
+    low = wp.floor(texel)
     out = _Neighbours()
-    out.weight = at - low
+    out.weight = texel - low
     out.a = int(low)
     out.b = out.a + 1
     if wrap == _REPEAT:
@@ -95,6 +94,7 @@ def _neighbours(x: float, size: int, wrap: int) -> _Neighbours:
 
 @wp.func
 def _texel(table: TextureTable, row: TextureRow, level: wp.vec3i, x: int, y: int) -> wp.vec3:
+    """The value of a pixel; -1 as a coordinate is outside the image."""
     if x < 0 or y < 0:
         return row.outside
     i = level[2] + (y * level[0] + x) * row.channels
@@ -105,8 +105,8 @@ def _texel(table: TextureTable, row: TextureRow, level: wp.vec3i, x: int, y: int
 
 
 @wp.func
-def coordinates(row: TextureRow, uv: wp.vec2) -> wp.vec2:
-    """The mesh's coordinates as the texture's."""
+def uv_to_st(row: TextureRow, uv: wp.vec2) -> wp.vec2:
+    """Transforms a mesh's uv coordinates into the st coordinates of a texture."""
     return wp.vec2(
         row.s[0] * uv[0] + row.s[1] * uv[1] + row.s[2],
         row.t[0] * uv[0] + row.t[1] * uv[1] + row.t[2],
@@ -115,13 +115,13 @@ def coordinates(row: TextureRow, uv: wp.vec2) -> wp.vec2:
 
 @wp.func
 def mip_level(table: TextureTable, row: TextureRow, uv_per_area: float, footprint: float) -> int:
-    """The level whose pixels are as wide as `footprint`, or somewhat finer.
+    """The row of the level whose pixels are as wide as `footprint`, or up to twice as fine.
 
-    `uv_per_area` is how much of the mesh's uv plane lies on a unit of area; the footprint a length.
+    `uv_per_area` is the area in the mesh's uv plane per unit of surface area; the footprint is a length.
     """
     finest = table.levels[row.first_level]
     area = wp.abs(row.s[0] * row.t[1] - row.s[1] * row.t[0]) * uv_per_area * float(finest[0]) * float(finest[1])
-    pixels = area * footprint * footprint  # of the finest level, under the footprint
+    pixels = area * footprint * footprint  # of the finest level, in the footprint
     if not (pixels > 1.0):
         return row.first_level
     level = wp.min(int(0.5 * wp.log2(wp.min(pixels, 1.0e30))), row.level_count - 1)
@@ -130,7 +130,7 @@ def mip_level(table: TextureTable, row: TextureRow, uv_per_area: float, footprin
 
 @wp.func
 def lookup(table: TextureTable, row: TextureRow, st: wp.vec2, level_row: int) -> wp.vec3:
-    """The texture at (s, t), (0, 0) being its lower left corner; a texture of one channel gives it thrice."""
+    """The value at (s, t) on a level; (0, 0) is the lower left corner, one channel is repeated in all three."""
     level = table.levels[level_row]
     x = _neighbours(st[0], level[0], row.wrap_s)
     y = _neighbours(1.0 - st[1], level[1], row.wrap_t)
@@ -139,13 +139,13 @@ def lookup(table: TextureTable, row: TextureRow, st: wp.vec2, level_row: int) ->
     return wp.lerp(top, bottom, y.weight)
 
 
-def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launcher: Launcher) -> Any:
-    """The `TextureTable` of textures, in their order.
+def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launcher: Launcher) -> TextureTable:
+    """Uploads textures, in their order.
 
     Args:
-        textures: Checked.
-        uv_sets: The names of the meshes' uv sets, in the order of their rows.
-        launcher: Whose device it is for.
+        textures: Validated textures.
+        uv_sets: Names of the meshes' uv sets, in the order of their rows.
+        launcher: Launcher of the device.
     """
     table = TextureTable()
     table.count = len(textures)
@@ -155,7 +155,7 @@ def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launche
     total = 0
     for k, (texture, pixels) in enumerate(zip(textures, _within_budget(textures), strict=True)):
         chain = mip_chain(pixels)
-        # Halves hold 11 bits between 6e-5 and 65504: scaled to 1, whatever the unit.
+        # Half floats hold 11 bits between 6e-5 and 65504: texels are scaled to at most 1, whatever their unit.
         largest = max(float(pixels.max()), -float(pixels.min()))
         scale = 2.0 ** math.frexp(largest)[1] if largest > 0.0 else 1.0
         rows[k]["first_level"], rows[k]["level_count"], rows[k]["channels"] = len(levels), len(chain), pixels.shape[2]
@@ -175,7 +175,7 @@ def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launche
 
 
 def _within_budget(textures: Sequence[Texture]) -> list[Floats]:
-    """The images, the largest halved until all fit, with their chains, into `MAX_BYTES` of halves."""
+    """The images, the largest halved until the mip chains of all fit into `MAX_BYTES` as half floats."""
     images: list[Floats] = [np.asarray(texture.pixels) for texture in textures]
     while sum(image.size for image in images) * 2 * 4 / 3 > MAX_BYTES:
         k = int(np.argmax([image.size for image in images]))
@@ -187,13 +187,13 @@ def _within_budget(textures: Sequence[Texture]) -> list[Floats]:
 
 
 def mean_on_triangles(texture: Texture, uvs: Floats, areas: Floats, footprint: float) -> Floats:
-    """Roughly the mean over the channels of what `lookup` gives on each triangle; never 0 where that is not, [m].
+    """Estimates the mean over channels and area of `lookup` on each triangle: positive wherever `lookup` is, [m].
 
     Args:
         texture: The texture.
-        uvs: Of the triangles' corners in the mesh's uv set, [m, 3, 2].
-        areas: Of the triangles, [m], in the unit of the footprint's square.
-        footprint: As given to `mip_level`.
+        uvs: Coordinates of the triangles' corners in the mesh's uv set, [m, 3, 2].
+        areas: Areas of the triangles, [m], in the unit of the footprint's square.
+        footprint: The footprint as passed to `mip_level`.
     """
     chain = [level[..., 0] for level in mip_chain(np.asarray(texture.pixels, np.float32).mean(axis=2, keepdims=True))]
     out = np.zeros(len(uvs))
@@ -204,54 +204,55 @@ def mean_on_triangles(texture: Texture, uvs: Floats, areas: Floats, footprint: f
 
 
 def _chunk_means(texture: Texture, chain: list[Floats], uvs: Floats, areas: Floats, footprint: float) -> Floats:
+    """`mean_on_triangles` for a chunk, from the channels' mean at every level of the mip chain."""
     matrix = np.asarray(texture.transform, np.float64)
     st = uvs @ matrix[:, :2].T + matrix[:, 2]
     low, high = st.min(axis=1), st.max(axis=1)
     for axis in range(2):
-        if texture.wrap[axis] == Wrap.BLACK:  # beyond the edges there is one value, which is added below
+        if texture.wrap[axis] == Wrap.BLACK:  # beyond the edges the value is constant; it is added below
             low[:, axis], high[:, axis] = low[:, axis].clip(0.0, 1.0), high[:, axis].clip(0.0, 1.0)
     sizes = np.array([level.shape[::-1] for level in chain], np.float64)
-    # A level on which the triangle spans a few pixels, and which is not finer than what is looked up.
+    # A level on which the triangle spans at most `_WINDOW` pixels, and which is not finer than the one looked up.
     edge1, edge2 = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
-    covered = 0.5 * np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) * abs(np.linalg.det(matrix[:, :2]))
-    density = covered / np.maximum(areas, 1e-300) * sizes[0].prod() * footprint**2
-    looked_up = 0.5 * np.log2(np.maximum(density, 1.0)) + 1.0
+    st_area = 0.5 * np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) * abs(np.linalg.det(matrix[:, :2]))
+    pixels = st_area / np.maximum(areas, 1e-300) * sizes[0].prod() * footprint**2
+    lookup_level = 0.5 * np.log2(np.maximum(pixels, 1.0)) + 1.0
     span = ((high - low) * sizes[0]).max(axis=1) / _WINDOW
-    chosen = np.maximum(np.ceil(np.log2(np.maximum(span, 1.0))), np.floor(looked_up)).astype(int)
-    chosen = np.minimum(chosen, len(chain) - 1)
+    level_of = np.maximum(np.ceil(np.log2(np.maximum(span, 1.0))), np.floor(lookup_level)).astype(int)
+    level_of = np.minimum(level_of, len(chain) - 1)
     b = (np.arange(_WINDOW) + 1.0 / 3.0) / _WINDOW
     u, v = np.meshgrid(b, b)
-    inside = u + v < 1.0
-    weights = np.stack([u[inside], v[inside], 1.0 - u[inside] - v[inside]])
+    is_inside = u + v < 1.0
+    weights = np.stack([u[is_inside], v[is_inside], 1.0 - u[is_inside] - v[is_inside]])
     steps = np.arange(-2, _WINDOW + 3)
     out = np.zeros(len(uvs))
-    for level in np.unique(chosen):
-        k = np.flatnonzero(chosen == level)
+    for level in np.unique(level_of):
+        k = np.flatnonzero(level_of == level)
         size = sizes[level]
         points = np.einsum("mki,kp->mpi", st[k], weights)
-        estimate = _nearest(texture, chain[level], np.floor(points * size)).mean(axis=1)
-        # Everything that interpolation can reach: pixels of a window around the triangle.
+        estimate = _fetch(texture, chain[level], np.floor(points * size)).mean(axis=1)
+        # The window around the triangle holds every pixel from which interpolation on the triangle may take a value.
         corner = np.floor(low[k] * size)
         x = corner[:, 0, None, None] + steps[:, None] + 0 * steps
         y = corner[:, 1, None, None] + 0 * steps[:, None] + steps
-        around = _nearest(texture, chain[level], np.stack([x, y], axis=-1)).mean(axis=(1, 2))
-        out[k] = 0.9 * estimate + 0.1 * around
+        window_mean = _fetch(texture, chain[level], np.stack([x, y], axis=-1)).mean(axis=(1, 2))
+        out[k] = 0.9 * estimate + 0.1 * window_mean
     if Wrap.BLACK in texture.wrap:
         out += 0.1 * np.mean(texture.outside)
     return out
 
 
-def _nearest(texture: Texture, level: Floats, pixels: Floats) -> Floats:
-    """Values of a level [h, w] at whole coordinates [..., 2], counted from the lower left."""
+def _fetch(texture: Texture, level: Floats, pixels: Floats) -> Floats:
+    """Values of a level [h, w] at integer pixel coordinates [..., 2], counted from the lower left."""
     index, outside = [], np.zeros(pixels.shape[:-1], bool)
     for axis, size in ((0, level.shape[1]), (1, level.shape[0])):
-        at = pixels[..., axis].clip(-1e9, 1e9).astype(np.int64)
+        texel = pixels[..., axis].clip(-1e9, 1e9).astype(np.int64)
         if texture.wrap[axis] == Wrap.REPEAT:
-            at %= size
+            texel %= size
         elif texture.wrap[axis] == Wrap.MIRROR:
-            at %= 2 * size
-            at = np.minimum(at, 2 * size - 1 - at)
+            texel %= 2 * size
+            texel = np.minimum(texel, 2 * size - 1 - texel)
         elif texture.wrap[axis] == Wrap.BLACK:
-            outside |= (at < 0) | (at >= size)
-        index.append(at.clip(0, size - 1))
+            outside |= (texel < 0) | (texel >= size)
+        index.append(texel.clip(0, size - 1))
     return np.where(outside, np.mean(texture.outside), level[level.shape[0] - 1 - index[1], index[0]])

@@ -19,7 +19,7 @@ from warp_ir.scene import InputError, Scene
 if TYPE_CHECKING:
     from pxr import Vt
 
-    from warp_ir.vpl.emission import Vpls
+    from warp_ir.vpl.trace import Vpls
 
 
 def run(args: argparse.Namespace) -> int:

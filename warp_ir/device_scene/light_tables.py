@@ -12,7 +12,7 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.scene_data import LightTables
 from warp_ir.light_modifiers import upload_light_modifiers
-from warp_ir.sampling.distribution2d import Distribution2DList, cell_measure
+from warp_ir.sampling.distribution2d import Distribution2DList, row_areas
 from warp_ir.scene import InputError, Light, LightKind, Scene
 
 
@@ -56,7 +56,7 @@ def upload_lights(
     tables.distributions = distributions.upload(launcher)
     data.textured_count = sum(k >= 0 for k in texture)
     data.modifier_count, data.shaped_count = tables.modifiers.count, tables.modifiers.shaped_count
-    data.only_sampled_count = tables.modifiers.sampled_count
+    data.only_sampled_count = tables.modifiers.only_sampled_count
     data.light_tables = launcher.array([tables], LightTables)
 
     shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
@@ -82,11 +82,11 @@ def _add_textures(
         key = id(light.texture), light.kind == LightKind.DOME
         theta = math.pi if light.kind == LightKind.DOME else 0.0
         tint = np.array(light.radiance) / max(float(np.mean(light.radiance)), 1.0e-30)
-        measure = cell_measure(len(light.texture), theta)
+        measure = row_areas(len(light.texture), theta)
         rows = light.texture.mean(axis=1, dtype=np.float64) @ tint / 3.0
         means[k] = float(rows @ measure / measure.sum())
         if key not in known:
-            known[key] = distributions.add(light.texture, theta=theta)
+            known[key] = distributions.add(light.texture, max_theta=theta)
         index.append(known[key])
     return index, means
 

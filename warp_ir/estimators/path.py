@@ -53,7 +53,7 @@ def _reflected(
     at_point = wp.dot(shading_normal, light.direction)
     if at_point <= 0.0 or wp.max(light.radiance) <= 0.0 or wp.dot(normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    visibility = light_visibility(scene, light.modifiers, position, mesh, from_camera, light.target)
+    visibility = light_visibility(scene, light.modifier_row, position, mesh, from_camera, light.target)
     if wp.max(visibility) <= 0.0:
         return wp.vec3(0.0)
     # A light without a pdf, such as a point light, is found by no ray: its sample has weight 1.

@@ -110,7 +110,7 @@ def _gather_pixels(
     x = _camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
-    radius = 1.0 / wp.sqrt(bound.least)  # of compensation: beyond it G cannot exceed the bound
+    radius = 1.0 / wp.sqrt(bound.minimum)  # of compensation: beyond it G cannot exceed the bound
     depth = int(0)
     rays = settings.rays
     while depth <= settings.max_bounces:
@@ -137,7 +137,7 @@ def _gather_pixels(
         clamped = float(0.0)
         if hit.triangle >= 0:
             g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-            clamped = clamped_fraction(bound.least, g)
+            clamped = clamped_fraction(bound.minimum, g)
             if clamped > 0.0:
                 emitted += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
         emitted = wp.cw_mul(throughput, emitted) * wp.pi

@@ -55,7 +55,7 @@ def learn_photon_target(scene: DeviceScene, probes: CameraProbes, launcher: Laun
     if before <= MIN_GAIN * after:
         return None
     photon_target = PhotonTarget()
-    photon_target.rings = _ANNULI
+    photon_target.annulus_count = _ANNULI
     photon_target.focus = launcher.array(focus, wp.vec4)
     photon_target.cdf = launcher.array(np.pad(cdf / cdf[:, -1:], ((0, 0), (1, 0))).reshape(-1), wp.float32)
     return photon_target

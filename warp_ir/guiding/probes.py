@@ -85,7 +85,7 @@ def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scrambl
             rows.weight[row] = (throughput[0] + throughput[1] + throughput[2]) * (1.0 / 3.0)
             cosine = wp.dot(shading_normal, light.direction)
             if cosine > 0.0 and wp.dot(normal, light.direction) > 0.0 and wp.max(light.radiance) > 0.0:
-                visibility = light_visibility(scene, light.modifiers, position, mesh, k == 0, light.target)
+                visibility = light_visibility(scene, light.modifier_row, position, mesh, k == 0, light.target)
                 contribution = wp.cw_mul(throughput, wp.cw_mul(light.radiance, visibility)) * (cosine / wp.pi)
                 rows.score[row] = (contribution[0] + contribution[1] + contribution[2]) * (1.0 / 3.0)
 

@@ -1,6 +1,7 @@
-"""Emitters: points on them, photons from them, rays that find them. Emissive triangles and UsdLux lights are one list.
+"""Emitters: sampling them by area, by solid angle and by photons, and intersecting them with rays.
 
-`shape.py` is one light, `light_visibility.py` what of it gets to a point.
+Emissive triangles and UsdLux lights are one list. `shape.py` is the geometry of one light, `visibility.py` the fraction
+of its emission that reaches a point, `bias_compensation.py` the energy that a bound on the geometry term removes.
 """
 
 from warp_ir.lights.bias_compensation import (

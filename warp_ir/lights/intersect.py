@@ -1,4 +1,4 @@
-"""Emitters that rays find, as far as they light what the ray comes from."""
+"""Emission of the emitters that a ray hits, with links, shaping and MIS weights."""
 
 import warp as wp
 
@@ -8,15 +8,15 @@ from warp_ir.lights.shape import (
     dome_from_world,
     intersect_shape,
     light_axis,
-    modifiers_of,
-    modifiers_of_surface,
+    light_texture,
+    modifier_row_of_light,
+    modifier_row_of_surface,
     shape_radiance,
-    texture_of,
 )
-from warp_ir.lights.visibility import may_intersect, shaping_along
-from warp_ir.sampling.distribution2d import direction_pdf, value_along
+from warp_ir.lights.visibility import may_intersect, shaping_at
+from warp_ir.sampling.distribution2d import direction_pdf, value_at_direction
 from warp_ir.scene import LightKind
-from warp_ir.surface import Hit, emission, glow, has_glow, scene_at
+from warp_ir.surface import Hit, camera_emission, emission, has_camera_emission, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,11 +28,11 @@ _DOME = wp.constant(int(LightKind.DOME))
 def intersect_lights(
     scene: SceneData, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_pdf: float, mesh: int
 ) -> wp.vec3:
-    """Radiance of the analytic lights that a ray meets before t_max; of those at infinity too if it escapes.
+    """Radiance of the analytic lights that a ray hits before t_max, including infinite lights if it `escapes`.
 
-    Lights block nothing, so all along the ray count that are linked to the mesh it leaves (-1: the eye).
-    `bsdf_pdf` is the density per solid angle with which the direction was sampled, for weighting against
-    `sample_light`; negative: no weighting.
+    Lights block nothing: all lights along the ray count that are linked to the mesh it leaves (-1: the camera).
+    `bsdf_pdf` is the pdf per solid angle with which the direction was sampled, for MIS against `sample_direct`;
+    negative: all MIS weights are 1.
     """
     if scene.shape_count > 0 or escapes:
         return _intersect_lights(scene.address, origin, direction, t_max, escapes, bsdf_pdf, mesh)
@@ -43,6 +43,7 @@ def intersect_lights(
 def _intersect_lights(
     address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_pdf: float, mesh: int
 ) -> wp.vec3:
+    """`intersect_lights` as a called function."""
     scene = scene_at(address)[0]
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
@@ -51,32 +52,40 @@ def _intersect_lights(
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
             hit = intersect_shape(scene, light, origin, direction)
-            if hit[3] > 0.0 and hit[3] < t_max and may_intersect(scene, modifiers_of(scene, light), mesh, bsdf_pdf):
+            if (
+                hit[3] > 0.0
+                and hit[3] < t_max
+                and may_intersect(scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf)
+            ):
                 radiance = shape_radiance(scene, light, origin, direction, hit[3])
-                radiance = wp.cw_mul(radiance, shaping_along(scene, modifiers_of(scene, light), -direction))
+                radiance = wp.cw_mul(radiance, shaping_at(scene, modifier_row_of_light(scene, light), -direction))
                 if bsdf_pdf >= 0.0:
                     radiance = radiance * mis_weight(bsdf_pdf, shape_pdf(scene, light, origin, direction, hit[3]))
                 total += radiance
     if escapes:
         for light in range(scene.light_count):
-            if scene.light_kind[light] >= _DISTANT and may_intersect(scene, modifiers_of(scene, light), mesh, bsdf_pdf):
+            if scene.light_kind[light] >= _DISTANT and may_intersect(
+                scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf
+            ):
                 total += _infinite_light_radiance(scene, light, direction, bsdf_pdf)
     return total
 
 
 @wp.func
 def _infinite_light_radiance(scene: SceneData, light: int, direction: wp.vec3, bsdf_pdf: float) -> wp.vec3:
-    """Radiance of a distant light or a dome along a unit direction, weighted."""
+    """Radiance of a distant light or a dome from a unit direction, times its MIS weight."""
     cone = wp.where(scene.light_kind[light] == _DOME, 2.0, scene.light_angle[light])
-    apart = direction - light_axis(scene, light)
-    if scene.light_kind[light] == _DISTANT and 0.5 * wp.dot(apart, apart) >= cone:
+    difference = direction - light_axis(scene, light)
+    if scene.light_kind[light] == _DISTANT and 0.5 * wp.dot(difference, difference) >= cone:
         return wp.vec3(0.0)
-    radiance = wp.cw_mul(scene.light_radiance[light], shaping_along(scene, modifiers_of(scene, light), -direction))
+    radiance = wp.cw_mul(
+        scene.light_radiance[light], shaping_at(scene, modifier_row_of_light(scene, light), -direction)
+    )
     pdf = 1.0 / (2.0 * wp.pi * cone)
-    texture = texture_of(scene, light)
+    texture = light_texture(scene, light)
     if texture >= 0:
         local = dome_from_world(scene, light, direction)
-        radiance = wp.cw_mul(radiance, value_along(scene.light_tables[0].distributions, texture, local))
+        radiance = wp.cw_mul(radiance, value_at_direction(scene.light_tables[0].distributions, texture, local))
         pdf = direction_pdf(scene.light_tables[0].distributions, texture, local)
     return radiance * mis_weight(bsdf_pdf, selection_probability(scene, scene.light_emitter[light]) * pdf)
 
@@ -85,20 +94,20 @@ def _infinite_light_radiance(scene: SceneData, light: int, direction: wp.vec3, b
 def modified_emission(
     scene: SceneData, hit: Hit, direction: wp.vec3, radiance: wp.vec3, mesh: int, bsdf_pdf: float
 ) -> wp.vec3:
-    """What of a surface's emission goes back along a ray from a mesh; arguments as for `intersect_lights`."""
-    modifiers = modifiers_of_surface(scene, hit.triangle)
-    if modifiers < 0:
+    """Emission of a surface towards a ray from a mesh, with links and shaping; arguments as for `intersect_lights`."""
+    row = modifier_row_of_surface(scene, hit.triangle)
+    if row < 0:
         return radiance
-    if not may_intersect(scene, modifiers, mesh, bsdf_pdf):
+    if not may_intersect(scene, row, mesh, bsdf_pdf):
         return wp.vec3(0.0)
-    return wp.cw_mul(radiance, shaping_along(scene, modifiers, -direction))
+    return wp.cw_mul(radiance, shaping_at(scene, row, -direction))
 
 
 @wp.func
 def emission_to_camera(scene: SceneData, hit: Hit, direction: wp.vec3, footprint: float) -> wp.vec3:
-    """Radiance that the camera sees of a surface which a unit direction has hit."""
-    if has_glow(scene, hit.triangle):
-        return glow(scene, hit, footprint)
+    """Emission seen by the camera of the surface hit by a unit direction."""
+    if has_camera_emission(scene, hit.triangle):
+        return camera_emission(scene, hit, footprint)
     radiance = emission(scene, hit, footprint)
     if wp.max(radiance) <= 0.0:
         return radiance
@@ -107,9 +116,9 @@ def emission_to_camera(scene: SceneData, hit: Hit, direction: wp.vec3, footprint
 
 @wp.func
 def surface_emission_mis(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_pdf: float, mesh: int) -> wp.vec3:
-    """What `intersect_lights` is for lights, for the surface that a unit direction, sampled from a BSDF, has hit."""
+    """Emission, times its MIS weight, of the surface hit by a unit direction that was sampled from a BSDF."""
     radiance = emission(scene, hit, scene.footprint)
     if wp.max(radiance) <= 0.0:
         return radiance
-    arrives = modified_emission(scene, hit, direction, radiance, mesh, bsdf_pdf)
-    return arrives * surface_mis_weight(scene, hit, direction, bsdf_pdf)
+    radiance = modified_emission(scene, hit, direction, radiance, mesh, bsdf_pdf)
+    return radiance * surface_mis_weight(scene, hit, direction, bsdf_pdf)

@@ -1,8 +1,8 @@
-"""Random points on emitters: emissive triangles and the lights of UsdLux are one list.
+"""Sampling of emitters by area: emissive triangles and the lights of UsdLux are one list.
 
-A point on an emitter is homogeneous, position (x, y, z, w): w = 1 for a place, w = 0 for the direction
-towards a distant light. Its normal (x, y, z, a) gives the emitter's cosine as max(0, a + n·ω): a = 0 for a
-surface, and n = 0, a = 1 for what shines the same everywhere. So nobody who gathers light needs a second case.
+A point on an emitter has a homogeneous position (x, y, z, w): w = 1 for a point, w = 0 for the direction towards an
+infinite light. Its normal (x, y, z, a) gives the emitter's cosine as max(0, a + n·ω): a = 0 for a surface, n = 0 and
+a = 1 for isotropic emission. One formula gathers light from every kind of emitter.
 """
 
 import warp as wp
@@ -11,18 +11,18 @@ from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
 from warp_ir.lights.shape import (
     area_scale,
     light_axis,
-    modifiers_of,
-    modifiers_of_surface,
+    light_texture,
+    modifier_row_of_light,
+    modifier_row_of_surface,
     offset_from_light,
-    texture_of,
     unit_area,
     world_from_dome,
 )
 from warp_ir.lights.visibility import only_sampled
-from warp_ir.sampling.distribution2d import cell_direction, cell_uv, sample_cell, value_along, value_at_uv
+from warp_ir.sampling.distribution2d import cell_direction, cell_uv, sample_cell, value_at_direction, value_at_uv
 from warp_ir.sampling.square_to import square_to_cone, square_to_disk
 from warp_ir.scene import LightKind
-from warp_ir.surface import alpha_at, emitted, offset, scene_at
+from warp_ir.surface import alpha_at, emission_at, offset_ray_origin, scene_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,28 +36,28 @@ _TRIANGLE = wp.constant(TRIANGLE_EMITTER)
 
 @wp.struct
 class EmitterSample:
-    """A random point on a random emitter."""
+    """A sampled point on a sampled emitter."""
 
     position: wp.vec4
     normal: wp.vec4
-    intensity: wp.vec3  # radiance / density: W/sr for a place, W/m² for a direction
-    pdf: float  # per area for a place, per solid angle for a direction; 0: no ray finds it, only `sample_light`
+    intensity: wp.vec3  # radiance / pdf: [W/sr] for a point, [W/m²] for a direction
+    pdf: float  # per area for a point, per solid angle for a direction; 0: rays cannot or must not hit the emitter
     emitter: int
-    modifiers: int  # row of its `LightModifiers`; -1: it has none
+    modifier_row: int  # of its `LightModifiers`; -1: none
 
 
 @wp.struct
-class Choice:
-    """A random emitter."""
+class EmitterSelection:
+    """A sampled emitter."""
 
     emitter: int
     probability: float
-    rest: float  # uniform in [0, 1) again, for what is left to choose
+    u_remapped: float  # the sample number stretched to [0, 1), for further decisions
 
 
 @wp.func
-def select_emitter(scene: SceneData, u: float) -> Choice:
-    """An emitter in proportion to power."""
+def select_emitter(scene: SceneData, u: float) -> EmitterSelection:
+    """Samples an emitter with the scene's selection probabilities."""
     low = int(0)
     high = scene.emitter_count
     while high - low > 1:
@@ -66,46 +66,48 @@ def select_emitter(scene: SceneData, u: float) -> Choice:
             low = middle
         else:
             high = middle
-    out = Choice()
+    out = EmitterSelection()
     out.emitter = low
     out.probability = scene.emitter_cdf[low + 1] - scene.emitter_cdf[low]
-    out.rest = (u - scene.emitter_cdf[low]) / out.probability
+    out.u_remapped = (u - scene.emitter_cdf[low]) / out.probability
     return out
 
 
 @wp.func
-def sample_emitter_area(scene: SceneData, choice: Choice, u: wp.vec2) -> EmitterSample:
-    """A point on an emitter, uniformly."""
-    item = scene.emitter_item[choice.emitter]
-    kind = scene.emitter_kind[choice.emitter]
+def sample_emitter_area(scene: SceneData, selection: EmitterSelection, u: wp.vec2) -> EmitterSample:
+    """Samples a point on a selected emitter: by area, or a direction by solid angle; textured ones by radiance."""
+    item = scene.emitter_item[selection.emitter]
+    kind = scene.emitter_kind[selection.emitter]
     out = EmitterSample()
     if kind == _TRIANGLE:
-        out = _sample_triangle(scene, item, choice.probability, choice.rest, u)
+        out = _sample_triangle(scene, item, selection.probability, selection.u_remapped, u)
     elif kind <= _CYLINDER:
-        out = _sample_shape(scene, item, choice.probability, u)
+        out = _sample_shape(scene, item, selection.probability, u)
     else:
-        out = _sample_point_or_direction(scene, item, choice.probability, u)
-    out.emitter = choice.emitter
-    if only_sampled(scene, out.modifiers):
+        out = _sample_point_or_direction(scene, item, selection.probability, u)
+    out.emitter = selection.emitter
+    if only_sampled(scene, out.modifier_row):
         out.pdf = 0.0
     return out
 
 
 @wp.func
-def sample_light(scene: SceneData, u_pick: float, u: wp.vec2) -> EmitterSample:
-    """A point on the scene's emitters: which one, in proportion to power; where on it, uniformly."""
-    return _sample_light(scene.address, u_pick, u)
+def sample_light(scene: SceneData, u_emitter: float, u: wp.vec2) -> EmitterSample:
+    """Samples a point on the scene's emitters: `select_emitter`, then `sample_emitter_area`."""
+    return _sample_light(scene.address, u_emitter, u)
 
 
 @wp.func(inline=False)
-def _sample_light(address: wp.uint64, u_pick: float, u: wp.vec2) -> EmitterSample:
+def _sample_light(address: wp.uint64, u_emitter: float, u: wp.vec2) -> EmitterSample:
+    """`sample_light` as a called function."""
     scene = scene_at(address)[0]
-    choice = select_emitter(scene, u_pick)
-    return sample_emitter_area(scene, choice, u)
+    selection = select_emitter(scene, u_emitter)
+    return sample_emitter_area(scene, selection, u)
 
 
 @wp.func
-def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: float, u: wp.vec2) -> EmitterSample:
+def _sample_triangle(scene: SceneData, triangle: int, probability: float, u_side: float, u: wp.vec2) -> EmitterSample:
+    """A point on an emissive triangle; `u_side` selects the side if both emit."""
     a = scene.points[scene.indices[3 * triangle]]
     b = scene.points[scene.indices[3 * triangle + 1]]
     c = scene.points[scene.indices[3 * triangle + 2]]
@@ -114,39 +116,40 @@ def _sample_triangle(scene: SceneData, triangle: int, probability: float, rest: 
     sides = float(1.0)
     if scene.emits_back[triangle] == 1:
         sides = 2.0
-        n = wp.where(rest < 0.5, n, -n)
+        n = wp.where(u_side < 0.5, n, -n)
     root = wp.sqrt(u[0])
-    at_a = 1.0 - root
-    at_b = root * (1.0 - u[1])
-    p = offset(a, b, c, at_a, at_b, n)
+    b0 = 1.0 - root
+    b1 = root * (1.0 - u[1])
+    p = offset_ray_origin(a, b, c, b0, b1, n)
     area = 0.5 * wp.length(cross)
     out = EmitterSample()
     out.pdf = probability / (area * sides)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
-    radiance = emitted(scene, triangle, at_a, at_b, area, scene.footprint)
+    radiance = emission_at(scene, triangle, b0, b1, area, scene.footprint)
     if scene.non_opaque_count > 0:
-        radiance = radiance * alpha_at(scene, triangle, at_a, at_b)
+        radiance = radiance * alpha_at(scene, triangle, b0, b1)
     out.intensity = radiance / out.pdf
-    out.modifiers = modifiers_of_surface(scene, triangle)
+    out.modifier_row = modifier_row_of_surface(scene, triangle)
     return out
 
 
 @wp.func
 def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) -> EmitterSample:
+    """A point on a light with an area."""
     kind = scene.light_kind[light]
     n = wp.vec3(0.0, 0.0, 1.0)
     q = wp.vec3(u[0] - 0.5, u[1] - 0.5, 0.0)
     radiance = scene.light_radiance[light]
-    relative = float(1.0)
-    texture = texture_of(scene, light)
+    relative_pdf = float(1.0)
+    texture = light_texture(scene, light)
     if texture >= 0:
         cell = sample_cell(scene.light_tables[0].distributions, texture, u)
-        place = cell_uv(scene.light_tables[0].distributions, texture, cell)
-        grid = scene.light_tables[0].distributions.distributions[texture]
-        relative = cell.probability * float(grid.rows) * float(grid.columns)
-        radiance = wp.cw_mul(radiance, value_at_uv(scene.light_tables[0].distributions, texture, place))
-        q = wp.vec3(0.5 - place[0], 0.5 - place[1], 0.0)
+        uv = cell_uv(scene.light_tables[0].distributions, texture, cell)
+        distribution = scene.light_tables[0].distributions.distributions[texture]
+        relative_pdf = cell.probability * float(distribution.rows) * float(distribution.columns)
+        radiance = wp.cw_mul(radiance, value_at_uv(scene.light_tables[0].distributions, texture, uv))
+        q = wp.vec3(0.5 - uv[0], 0.5 - uv[1], 0.0)
     if kind == _DISK:
         d = square_to_disk(u)
         q = wp.vec3(d[0], d[1], 0.0)
@@ -160,27 +163,28 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     p = scene.light_origin[light] + scene.light_axes[light] * q
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
     out = EmitterSample()
-    out.pdf = probability * relative / (unit_area(kind) * area_scale(scene, light, n))
+    out.pdf = probability * relative_pdf / (unit_area(kind) * area_scale(scene, light, n))
     p = offset_from_light(p, world_n)
     out.position = wp.vec4(p[0], p[1], p[2], 1.0)
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
     out.intensity = radiance / out.pdf
-    out.modifiers = modifiers_of(scene, light)
+    out.modifier_row = modifier_row_of_light(scene, light)
     return out
 
 
 @wp.func
 def _sample_point_or_direction(scene: SceneData, light: int, probability: float, u: wp.vec2) -> EmitterSample:
+    """A point light, or a direction towards a distant light or a dome."""
     kind = scene.light_kind[light]
     out = EmitterSample()
-    out.modifiers = modifiers_of(scene, light)
+    out.modifier_row = modifier_row_of_light(scene, light)
     out.normal = wp.vec4(0.0, 0.0, 0.0, 1.0)
     if kind == _POINT:
         p = scene.light_origin[light]
         out.position = wp.vec4(p[0], p[1], p[2], 1.0)
         out.intensity = scene.light_radiance[light] / probability
         return out
-    texture = texture_of(scene, light)
+    texture = light_texture(scene, light)
     if texture >= 0:
         cell = sample_cell(scene.light_tables[0].distributions, texture, u)
         local = cell_direction(scene.light_tables[0].distributions, texture, cell)
@@ -189,7 +193,7 @@ def _sample_point_or_direction(scene: SceneData, light: int, probability: float,
         out.position = wp.vec4(d[0], d[1], d[2], 0.0)
         out.pdf = probability * local[3]
         radiance = wp.cw_mul(
-            scene.light_radiance[light], value_along(scene.light_tables[0].distributions, texture, xyz)
+            scene.light_radiance[light], value_at_direction(scene.light_tables[0].distributions, texture, xyz)
         )
         out.intensity = radiance / out.pdf
         return out

@@ -1,4 +1,4 @@
-"""Next-event estimation: light that may come to a point, sampled towards it, and its density along a ray."""
+"""Next-event estimation: sampling of the emitters from a point, its pdf for a given ray, and MIS weights."""
 
 import warp as wp
 
@@ -7,9 +7,9 @@ from warp_ir.lights.sample_area import sample_emitter_area, select_emitter
 from warp_ir.lights.shape import (
     area_scale,
     light_axis,
-    modifiers_of,
+    light_texture,
+    modifier_row_of_light,
     offset_from_light,
-    texture_of,
     texture_uv,
     unit_area,
 )
@@ -27,71 +27,71 @@ _CYLINDER = wp.constant(int(LightKind.CYLINDER))
 
 @wp.struct
 class DirectSample:
-    """Light that comes to a point from a random direction."""
+    """A sampled direction towards an emitter, and the radiance from there."""
 
     direction: wp.vec3  # unit, towards the light
-    target: wp.vec4  # the place on the light, homogeneous
-    radiance: wp.vec3  # over the density of the direction: an estimate of ∫ L dω, unshadowed and unshaped
-    pdf: float  # of the direction, per solid angle; 0: no ray finds the light, only `sample_direct`
-    modifiers: int  # row of the light's `LightModifiers`; -1: it has none
+    target: wp.vec4  # the sampled point on the light, homogeneous
+    radiance: wp.vec3  # over the pdf: an estimate of ∫ L dω without shadows and shaping
+    pdf: float  # of the direction, per solid angle; 0: rays cannot or must not hit the light, its MIS weight is 1
+    modifier_row: int  # of the light's `LightModifiers`; -1: none
 
 
 @wp.func
-def sample_direct(scene: SceneData, position: wp.vec3, u_pick: float, u: wp.vec2) -> DirectSample:
-    """Light that may come to a point: from which emitter, in proportion to power; if it is a shape, by solid angle."""
-    choice = select_emitter(scene, u_pick)
-    item = scene.emitter_item[choice.emitter]
+def sample_direct(scene: SceneData, position: wp.vec3, u_emitter: float, u: wp.vec2) -> DirectSample:
+    """Samples an emitter, and a direction from a point towards it: by solid angle if it is a shape, else by area."""
+    selection = select_emitter(scene, u_emitter)
+    item = scene.emitter_item[selection.emitter]
     out = DirectSample()
-    if scene.emitter_kind[choice.emitter] <= _CYLINDER and texture_of(scene, item) < 0:
-        aim = sample_solid_angle(
+    if scene.emitter_kind[selection.emitter] <= _CYLINDER and light_texture(scene, item) < 0:
+        sample = sample_solid_angle(
             scene.light_kind[item],
             scene.light_axes[item],
             scene.light_inverse[item],
             scene.light_origin[item] - position,
             u,
         )
-        if not aim.pdf > 0.0:
+        if not sample.pdf > 0.0:
             return out
-        out.direction = wp.normalize(aim.way)
-        off = -out.direction
+        out.direction = wp.normalize(sample.offset)
+        outward = -out.direction
         if scene.light_kind[item] <= _DISK:
-            off = wp.normalize(light_axis(scene, item))
-        p = offset_from_light(position + aim.way, off)
+            outward = wp.normalize(light_axis(scene, item))
+        p = offset_from_light(position + sample.offset, outward)
         out.target = wp.vec4(p[0], p[1], p[2], 1.0)
-        out.pdf = aim.pdf * choice.probability
+        out.pdf = sample.pdf * selection.probability
         out.radiance = scene.light_radiance[item] / out.pdf
-        out.modifiers = modifiers_of(scene, item)
-        if only_sampled(scene, out.modifiers):
+        out.modifier_row = modifier_row_of_light(scene, item)
+        if only_sampled(scene, out.modifier_row):
             out.pdf = 0.0
         return out
-    point = sample_emitter_area(scene, choice, u)
+    point = sample_emitter_area(scene, selection, u)
     xyz = wp.vec3(point.position[0], point.position[1], point.position[2])
     to_light = xyz - position * point.position[3]
-    squared = wp.dot(to_light, to_light)
-    out.direction = to_light / wp.sqrt(squared)
-    facing = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
-    per_area = wp.max(0.0, point.normal[3] - wp.dot(facing, out.direction)) / squared
+    distance_squared = wp.dot(to_light, to_light)
+    out.direction = to_light / wp.sqrt(distance_squared)
+    normal = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
+    solid_angle_per_area = wp.max(0.0, point.normal[3] - wp.dot(normal, out.direction)) / distance_squared
     out.target = point.position
-    out.radiance = point.intensity * per_area
-    if per_area > 0.0:
-        out.pdf = point.pdf / per_area
-    out.modifiers = point.modifiers
+    out.radiance = point.intensity * solid_angle_per_area
+    if solid_angle_per_area > 0.0:
+        out.pdf = point.pdf / solid_angle_per_area
+    out.modifier_row = point.modifier_row
     return out
 
 
 @wp.func
-def power_heuristic(pdf: float, other: float) -> float:
-    """Weight of a sample that another way of sampling might have found as well (Veach 1997, β = 2).
+def power_heuristic(pdf: float, other_pdf: float) -> float:
+    """MIS weight of a sample of one technique against another (power heuristic, Veach 1997, β = 2).
 
-    Where one way is nearly exact, as towards the lights, it leaves less of the other's noise than the balance does.
+    Where one technique is nearly exact, as light sampling is, it leaves less noise than the balance heuristic.
     """
-    ratio = other / pdf
+    ratio = other_pdf / pdf
     return 1.0 / (1.0 + ratio * ratio)
 
 
 @wp.func
 def selection_probability(scene: SceneData, emitter: int) -> float:
-    """With which an emitter is chosen."""
+    """Probability of selecting an emitter; 0 for -1."""
     if emitter < 0:
         return 0.0
     return scene.emitter_cdf[emitter + 1] - scene.emitter_cdf[emitter]
@@ -99,10 +99,10 @@ def selection_probability(scene: SceneData, emitter: int) -> float:
 
 @wp.func
 def shape_pdf(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> float:
-    """The density per solid angle with which `sample_direct` gives a direction that meets a shape at t."""
+    """The pdf per solid angle with which `sample_direct` samples a direction that meets a light with an area at t."""
     kind = scene.light_kind[light]
     probability = selection_probability(scene, scene.light_emitter[light])
-    texture = texture_of(scene, light)
+    texture = light_texture(scene, light)
     if texture < 0:
         to_light = scene.light_origin[light] - origin
         return probability * solid_angle_pdf(
@@ -111,13 +111,13 @@ def shape_pdf(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3,
     n = wp.vec3(0.0, 0.0, 1.0)  # only rectangles have textures
     cosine = -wp.dot(wp.normalize(wp.transpose(scene.light_inverse[light]) * n), direction)
     pdf = probability * t * t / (unit_area(kind) * area_scale(scene, light, n) * cosine)
-    place = texture_uv(scene, light, origin, direction, t)
-    return pdf * uv_pdf(scene.light_tables[0].distributions, texture, place)
+    uv = texture_uv(scene, light, origin, direction, t)
+    return pdf * uv_pdf(scene.light_tables[0].distributions, texture, uv)
 
 
 @wp.func
 def mis_weight(bsdf_pdf: float, light_pdf: float) -> float:
-    """Of a light that a ray has found; 1 if the ray was no sample of a BSDF."""
+    """MIS weight of a light hit by a ray sampled from a BSDF; 1 for a ray that was not (negative `bsdf_pdf`)."""
     if bsdf_pdf < 0.0:
         return 1.0
     return power_heuristic(bsdf_pdf, light_pdf)
@@ -125,7 +125,7 @@ def mis_weight(bsdf_pdf: float, light_pdf: float) -> float:
 
 @wp.func
 def surface_mis_weight(scene: SceneData, hit: Hit, direction: wp.vec3, bsdf_pdf: float) -> float:
-    """The weight of the emission of an emissive surface that a unit direction, sampled from a BSDF, has hit."""
+    """MIS weight of the emission of a surface hit by a unit direction that was sampled from a BSDF."""
     a = scene.points[scene.indices[3 * hit.triangle]]
     b = scene.points[scene.indices[3 * hit.triangle + 1]]
     c = scene.points[scene.indices[3 * hit.triangle + 2]]

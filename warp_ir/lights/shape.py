@@ -1,4 +1,4 @@
-"""One light: where a ray meets it, how large it is, and its radiance there, before shaping and shadows."""
+"""The shape of one light: its intersection with a ray, its area, and its radiance before shaping and shadows."""
 
 import warp as wp
 
@@ -16,40 +16,40 @@ _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 
 
 @wp.func
-def texture_of(scene: SceneData, light: int) -> int:
-    """The grid that multiplies a light's radiance, or -1."""
+def light_texture(scene: SceneData, light: int) -> int:
+    """The distribution whose values multiply a light's radiance; -1: none."""
     if scene.textured_count == 0:
         return -1
     return scene.light_tables[0].texture[light]
 
 
 @wp.func
-def modifiers_of(scene: SceneData, light: int) -> int:
-    """The row of a light's control, or -1; light -1 is a surface."""
+def modifier_row_of_light(scene: SceneData, light: int) -> int:
+    """The row of a light's `LightModifiers`; -1: none. Light -1 is a surface."""
     if scene.modifier_count == 0 or light < 0:
         return -1
-    return scene.light_tables[0].modifiers.of_light[light]
+    return scene.light_tables[0].modifiers.row_of_light[light]
 
 
 @wp.func
-def modifiers_of_surface(scene: SceneData, triangle: int) -> int:
-    """The row of the control of an emissive surface, or -1."""
+def modifier_row_of_surface(scene: SceneData, triangle: int) -> int:
+    """The row of the `LightModifiers` of an emissive surface; -1: none."""
     if scene.modifier_count == 0:
         return -1
-    if scene.light_tables[0].modifiers.surface_count == 0:
+    if scene.light_tables[0].modifiers.modified_mesh_count == 0:
         return -1
-    return scene.light_tables[0].modifiers.of_mesh[scene.triangle_mesh[triangle]]
+    return scene.light_tables[0].modifiers.row_of_mesh[scene.triangle_mesh[triangle]]
 
 
 @wp.func
 def area_scale(scene: SceneData, light: int, n: wp.vec3) -> float:
-    """Area of a shape's surface over that of the unit shape, where the unit shape's normal is `n` (Nanson)."""
+    """Area element of a shape over that of the unit shape, where the unit shape's normal is `n` (Nanson's formula)."""
     return wp.abs(wp.determinant(scene.light_axes[light])) * wp.length(wp.transpose(scene.light_inverse[light]) * n)
 
 
 @wp.func
 def unit_area(kind: int) -> float:
-    """Area of a unit shape."""
+    """Area of the unit shape of a kind of light."""
     if kind == _RECT:
         return 1.0
     if kind == _DISK:
@@ -61,14 +61,14 @@ def unit_area(kind: int) -> float:
 
 @wp.func
 def light_axis(scene: SceneData, light: int) -> wp.vec3:
-    """The unit direction towards a distant light; along the normal of a flat one."""
+    """The third axis: the unit direction towards a distant light, or the unit normal of a flat one."""
     m = scene.light_axes[light]
     return wp.vec3(m[0, 2], m[1, 2], m[2, 2])
 
 
 @wp.func
 def dome_from_world(scene: SceneData, light: int, direction: wp.vec3) -> wp.vec3:
-    """A direction of the world where a dome's texture has its pole along +z and begins at +x."""
+    """A world direction in the frame of a dome's texture, whose pole is +z and whose first column begins at +x."""
     d = wp.transpose(scene.light_axes[light]) * direction
     return wp.vec3(-d[2], d[0], d[1])
 
@@ -81,7 +81,7 @@ def world_from_dome(scene: SceneData, light: int, d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def intersect_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec4:
-    """Where a ray meets the emitting side of a light: the unit shape's normal there, and t (-1: it does not)."""
+    """Intersects a ray with the emitting side of a light: the unit shape's normal there, and t (-1: a miss)."""
     kind = scene.light_kind[light]
     o = scene.light_inverse[light] * (origin - scene.light_origin[light])
     d = scene.light_inverse[light] * direction
@@ -97,19 +97,21 @@ def intersect_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp
         if kind == _DISK and x * x + y * y > 1.0:
             return miss
         return wp.vec4(0.0, 0.0, 1.0, t)
-    flat = wp.where(kind == _CYLINDER, 0.0, 1.0)
-    o2 = wp.vec3(o[0] * flat, o[1], o[2])
-    d2 = wp.vec3(d[0] * flat, d[1], d[2])
+    x_scale = wp.where(kind == _CYLINDER, 0.0, 1.0)
+    o2 = wp.vec3(o[0] * x_scale, o[1], o[2])
+    d2 = wp.vec3(d[0] * x_scale, d[1], d[2])
     a = wp.dot(d2, d2)
     b = wp.dot(o2, d2)
     if b >= 0.0 or a == 0.0:
         return miss
-    # The squared distance of the line from the axis, computed so that a far origin does not cancel it.
+    # The squared distance of the line from the axis, without cancellation for a distant origin.
     nearest = o2 - d2 * (b / a)
-    h = 1.0 - wp.dot(nearest, nearest)
-    if h <= 0.0:
+    half_chord_squared = 1.0 - wp.dot(nearest, nearest)
+    if half_chord_squared <= 0.0:
         return miss
-    t = -b / a - wp.sqrt(h / a)  # the first of the two: the other is seen from inside
+    t = -b / a - wp.sqrt(
+        half_chord_squared / a
+    )  # the first intersection: the second is on the inside, which does not emit
     if t <= 0.0 or (kind == _CYLINDER and wp.abs(o[0] + t * d[0]) > 0.5):
         return miss
     n = wp.normalize(o2 + t * d2)
@@ -118,22 +120,22 @@ def intersect_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp
 
 @wp.func
 def shape_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
-    """Radiance of a light with an area where a ray meets it, before shaping."""
-    texture = texture_of(scene, light)
+    """Radiance of a light with an area where a ray meets it at t, before shaping."""
+    texture = light_texture(scene, light)
     if texture < 0:
         return scene.light_radiance[light]
-    place = texture_uv(scene, light, origin, direction, t)
-    return wp.cw_mul(scene.light_radiance[light], value_at_uv(scene.light_tables[0].distributions, texture, place))
+    uv = texture_uv(scene, light, origin, direction, t)
+    return wp.cw_mul(scene.light_radiance[light], value_at_uv(scene.light_tables[0].distributions, texture, uv))
 
 
 @wp.func
 def texture_uv(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
-    """Place in [0, 1]² on the texture of a rectangle that a ray meets at t: from +X to -X, from +Y to -Y."""
+    """Texture coordinates in [0, 1]² where a ray meets a rectangle at t: u from +X to -X, v from +Y to -Y."""
     q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
     return wp.vec2(0.5 - q[0], 0.5 - q[1])
 
 
 @wp.func
 def offset_from_light(p: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """A place on a light, moved by 8 ulp along a unit direction: a light often lies in the ceiling's plane."""
+    """A point on a light, offset by 8 ulp along a unit direction, since lights often lie in the plane of a ceiling."""
     return p + direction * (wp.max(wp.abs(p)) * _EIGHT_ULP)

@@ -1,6 +1,6 @@
-"""How much of a light's emission gets to a point: shaping, links and shadows.
+"""The fraction of a light's emission that reaches a point: visibility, shaping and light links.
 
-Where a light has a `LightModifiers`, `light_visibility` takes the place of `visible`.
+For lights with a `LightModifiers`, `light_visibility` takes the place of `visible`.
 """
 
 import warp as wp
@@ -12,56 +12,54 @@ from warp_ir.surface import Hit, closest, scene_at, spawn_ray_origin, visible
 wp.set_module_options({"enable_backward": False})
 
 CROSSINGS = wp.constant(64)
-"""Most surfaces without a shadow that light is followed through."""
+"""Most surfaces that light passes because they do not shadow it."""
 
 
 @wp.func
-def only_sampled(scene: SceneData, modifiers: int) -> bool:
-    """Whether a light sees other surfaces than rays do, so that it may only be sampled."""
-    if modifiers < 0:
+def only_sampled(scene: SceneData, row: int) -> bool:
+    """Whether only sampling the light may count it, because some surfaces that block rays do not shadow it."""
+    if row < 0:
         return False
     return (
-        scene.light_tables[0].modifiers.rows[modifiers].shadows == 0
-        or scene.light_tables[0].modifiers.rows[modifiers].shadowless >= 0
+        scene.light_tables[0].modifiers.rows[row].shadows == 0
+        or scene.light_tables[0].modifiers.rows[row].shadowless >= 0
     )
 
 
 @wp.func
-def shaping_along(scene: SceneData, modifiers: int, direction: wp.vec3) -> wp.vec3:
-    """Factor of the radiance that a light emits along a unit direction."""
-    if modifiers < 0:
+def shaping_at(scene: SceneData, row: int, direction: wp.vec3) -> wp.vec3:
+    """The factor by which shaping changes the radiance that a light emits in a unit direction."""
+    if row < 0:
         return wp.vec3(1.0)
-    return shaping_factor(
-        scene.light_tables[0].modifiers.rows[modifiers], scene.light_tables[0].distributions, direction
-    )
+    return shaping_factor(scene.light_tables[0].modifiers.rows[row], scene.light_tables[0].distributions, direction)
 
 
 @wp.func
-def may_intersect(scene: SceneData, modifiers: int, mesh: int, bsdf_pdf: float) -> bool:
-    """Whether a ray from a mesh (-1: the eye) counts the light it finds, `bsdf_pdf` being as for `intersect_lights`."""
-    if modifiers < 0:
+def may_intersect(scene: SceneData, row: int, mesh: int, bsdf_pdf: float) -> bool:
+    """Whether a ray from a mesh (-1: the camera) counts a light that it hits; `bsdf_pdf` as for `intersect_lights`."""
+    if row < 0:
         return True
-    if in_link_set(scene.light_tables[0].modifiers, scene.light_tables[0].modifiers.rows[modifiers].unlit, mesh):
+    if in_link_set(scene.light_tables[0].modifiers, scene.light_tables[0].modifiers.rows[row].unlit, mesh):
         return False
-    return bsdf_pdf < 0.0 or not only_sampled(scene, modifiers)
+    return bsdf_pdf < 0.0 or not only_sampled(scene, row)
 
 
 @wp.func
 def light_visibility(
-    scene: SceneData, modifiers: int, position: wp.vec3, mesh: int, from_camera: bool, target: wp.vec4
+    scene: SceneData, modifier_row: int, position: wp.vec3, mesh: int, from_camera: bool, target: wp.vec4
 ) -> wp.vec3:
-    """How much of the light from a point on a light arrives at a point of a mesh.
+    """The fraction of the radiance of a point on a light that reaches a point of a mesh.
 
     Args:
         scene: The scene.
-        modifiers: Row of the light's `LightModifiers`; -1: only visibility counts.
-        position: The point, off its surface.
-        mesh: The mesh it belongs to.
-        from_camera: Whether the camera sees the point: only there may a light do without shadows.
-        target: Homogeneous; off its surface.
+        modifier_row: Row of the light's `LightModifiers`; -1: only visibility counts.
+        position: The receiving point, off its surface.
+        mesh: The mesh of the receiving point.
+        from_camera: Whether the camera sees the receiving point: only there may a light cast no shadows.
+        target: The point on the light, homogeneous and off its surface.
     """
-    if modifiers >= 0:
-        return _modified_visibility(scene.address, modifiers, position, mesh, from_camera, target)
+    if modifier_row >= 0:
+        return _modified_visibility(scene.address, modifier_row, position, mesh, from_camera, target)
     if visible(scene, position, target):
         return wp.vec3(1.0)
     return wp.vec3(0.0)
@@ -71,6 +69,7 @@ def light_visibility(
 def _modified_visibility(
     address: wp.uint64, row: int, position: wp.vec3, mesh: int, from_camera: bool, target: wp.vec4
 ) -> wp.vec3:
+    """`light_visibility` for a light with a row of `LightModifiers`."""
     scene = scene_at(address)[0]
     modifiers = scene.light_tables[0].modifiers.rows[row]
     to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
@@ -90,7 +89,7 @@ def _modified_visibility(
 
 @wp.func
 def _visible_ignoring(scene: SceneData, shadowless: int, position: wp.vec3, target: wp.vec4) -> bool:
-    """`visible` as if the meshes of a link set were not there."""
+    """`visible` for light that the meshes of a link set do not block."""
     origin = position
     xyz = wp.vec3(target[0], target[1], target[2])
     for _ in range(CROSSINGS):
@@ -106,5 +105,5 @@ def _visible_ignoring(scene: SceneData, shadowless: int, position: wp.vec3, targ
 
 @wp.func
 def continue_behind(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
-    """Where a ray goes on that passes through the surface it has hit."""
+    """The origin at which a ray continues behind the surface that it has hit."""
     return spawn_ray_origin(scene, hit, wp.normalize(direction) - hit.normal)

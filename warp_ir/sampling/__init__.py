@@ -1,1 +1,1 @@
-"""Where samples come from: a low-discrepancy sequence, and maps from the unit square to what is sampled."""
+"""Sampling: a low-discrepancy sequence, maps from the unit square to directions, and tabulated distributions."""

@@ -1,64 +1,65 @@
-"""Tables over a rectangle or over directions, and how to sample them: light textures, skies, photometry of lamps.
+"""Tabulated 2D distributions over a rectangle or over directions: textures of lights, skies, photometry of lamps.
 
-A grid divides a rectangle evenly into cells; or the directions up to a polar angle into rows (bands of the polar angle
-θ) and columns (sectors of the azimuth φ). A cell is drawn by two cumulative distributions, first its row and then its
-column; the place in it is uniform, by area or by solid angle. Values are interpolated between the centres of cells.
+A distribution divides a rectangle evenly into cells, or the directions up to a polar angle into rows (bands of the
+polar angle θ) and columns (sectors of the azimuth φ). Sampling inverts two cumulative distribution functions, first
+that of the rows and then that of the row's columns; within a cell samples are uniform by area or by solid angle.
+Values are interpolated bilinearly between the centres of cells.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
+from warp_ir.scene import Floats
 
 wp.set_module_options({"enable_backward": False})
 
-_EVENLY = 0.01
-"""Part of the samples that is spread evenly over what is not black: rounding must not make dark cells unreachable."""
-_STEPS = 2.0**24
-"""Sample numbers are multiples of 1/_STEPS; cumulative probabilities too, so that every cell gets exactly its share."""
-_COMPARED = 2**18
-"""Numbers of a table up to which it is compared by its values."""
+_UNIFORM_FRACTION = 0.01
+"""Fraction of the samples spread evenly over all cells of positive weight, so that rounding leaves none unreachable."""
+_CDF_STEPS = 2.0**24
+"""Sample numbers are multiples of 1/_CDF_STEPS; so are the CDFs, which makes every cell's probability exact."""
+_MAX_COMPARED_SIZE = 2**18
+"""Tables of at most this many numbers are compared by value, larger ones by identity."""
 
 
 @wp.struct
-class Grid:
-    """One table: rows x columns cells, the first row at v = 0 or θ = 0."""
+class Distribution2D:
+    """One table of rows x columns cells; the first row is at v = 0 or θ = 0."""
 
     rows: int
     columns: int
-    cdf: int  # where its rows + 1 cumulative probabilities begin, then columns + 1 for every row; -1: none
-    texels: int  # where its rows x columns values begin
-    theta: float  # over directions: the polar angle at which the last row ends; 0: over a rectangle
+    cdf: int  # index of the rows + 1 values of the row CDF; columns + 1 for every row follow
+    texels: int  # index of the rows x columns values
+    max_theta: float  # over directions: the polar angle at which the last row ends [rad]; 0: over a rectangle
 
 
 @wp.struct
 class Distribution2DTables:
-    """All grids of a scene."""
+    """All distributions of a scene."""
 
-    distributions: wp.array[Grid]
+    distributions: wp.array[Distribution2D]
     cdf: wp.array[wp.float32]
     texels: wp.array[wp.vec3]
 
 
 @wp.struct
-class Cell:
-    """A cell that was drawn, and where in it."""
+class CellSample:
+    """A sampled cell, and a point in it."""
 
     row: int
     column: int
     x: float  # in [0, 1) along the row
-    y: float
+    y: float  # in [0, 1) across the rows
     probability: float  # of the cell
 
 
 @wp.func
-def _find(cdf: wp.array[wp.float32], first: int, count: int, u: float) -> int:
-    """The interval of `count` that holds u; never an empty one."""
+def _find_interval(cdf: wp.array[wp.float32], first: int, count: int, u: float) -> int:
+    """The non-empty interval, of `count`, whose CDF values enclose u."""
     low = int(0)
     high = count
     while high - low > 1:
@@ -71,28 +72,29 @@ def _find(cdf: wp.array[wp.float32], first: int, count: int, u: float) -> int:
 
 
 @wp.func(inline=False)
-def sample_cell(tables: Distribution2DTables, index: int, u: wp.vec2) -> Cell:
-    """A cell by its probability: u[1] chooses the row, u[0] the column."""
-    grid = tables.distributions[index]
-    cell = Cell()
-    cell.row = _find(tables.cdf, grid.cdf, grid.rows, u[1])
-    low = tables.cdf[grid.cdf + cell.row]
-    of_row = tables.cdf[grid.cdf + cell.row + 1] - low
-    cell.y = (u[1] - low) / of_row
-    first = grid.cdf + grid.rows + 1 + cell.row * (grid.columns + 1)
-    cell.column = _find(tables.cdf, first, grid.columns, u[0])
+def sample_cell(tables: Distribution2DTables, index: int, u: wp.vec2) -> CellSample:
+    """Samples a cell in proportion to its weight: u[1] selects the row, u[0] the column."""
+    distribution = tables.distributions[index]
+    cell = CellSample()
+    cell.row = _find_interval(tables.cdf, distribution.cdf, distribution.rows, u[1])
+    low = tables.cdf[distribution.cdf + cell.row]
+    row_probability = tables.cdf[distribution.cdf + cell.row + 1] - low
+    cell.y = (u[1] - low) / row_probability
+    first = distribution.cdf + distribution.rows + 1 + cell.row * (distribution.columns + 1)
+    cell.column = _find_interval(tables.cdf, first, distribution.columns, u[0])
     low = tables.cdf[first + cell.column]
-    of_column = tables.cdf[first + cell.column + 1] - low
-    cell.x = (u[0] - low) / of_column
-    cell.probability = of_row * of_column
+    column_probability = tables.cdf[first + cell.column + 1] - low
+    cell.x = (u[0] - low) / column_probability
+    cell.probability = row_probability * column_probability
     return cell
 
 
 @wp.func
-def _cell_probability(tables: Distribution2DTables, grid: Grid, row: int, column: int) -> float:
-    first = grid.cdf + grid.rows + 1 + row * (grid.columns + 1) + column
-    of_row = tables.cdf[grid.cdf + row + 1] - tables.cdf[grid.cdf + row]
-    return of_row * (tables.cdf[first + 1] - tables.cdf[first])
+def _cell_probability(tables: Distribution2DTables, distribution: Distribution2D, row: int, column: int) -> float:
+    """The probability of sampling a cell."""
+    first = distribution.cdf + distribution.rows + 1 + row * (distribution.columns + 1) + column
+    row_probability = tables.cdf[distribution.cdf + row + 1] - tables.cdf[distribution.cdf + row]
+    return row_probability * (tables.cdf[first + 1] - tables.cdf[first])
 
 
 @wp.func
@@ -103,210 +105,225 @@ def _versine(theta: float) -> float:
 
 
 @wp.func
-def _solid_angle(grid: Grid, row: int) -> float:
-    """Of one cell of a row."""
-    step = grid.theta / float(grid.rows)
-    bands = _versine(step * float(row + 1)) - _versine(step * float(row))
-    return bands * 2.0 * wp.pi / float(grid.columns)
+def _cell_solid_angle(distribution: Distribution2D, row: int) -> float:
+    """Solid angle [sr] of one cell of a row."""
+    row_angle = distribution.max_theta / float(distribution.rows)
+    height = _versine(row_angle * float(row + 1)) - _versine(row_angle * float(row))
+    return height * 2.0 * wp.pi / float(distribution.columns)
 
 
 @wp.func(inline=False)
-def cell_direction(tables: Distribution2DTables, index: int, cell: Cell) -> wp.vec4:
-    """The unit direction of a place in a cell, around +z, and its density per solid angle."""
-    grid = tables.distributions[index]
-    step = grid.theta / float(grid.rows)
-    h = wp.lerp(_versine(step * float(cell.row)), _versine(step * float(cell.row + 1)), cell.y)
+def cell_direction(tables: Distribution2DTables, index: int, cell: CellSample) -> wp.vec4:
+    """The unit direction around +z of a sample in a cell, and its pdf per solid angle."""
+    distribution = tables.distributions[index]
+    row_angle = distribution.max_theta / float(distribution.rows)
+    h = wp.lerp(_versine(row_angle * float(cell.row)), _versine(row_angle * float(cell.row + 1)), cell.y)
     r = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
-    phi = 2.0 * wp.pi * (float(cell.column) + cell.x) / float(grid.columns)
-    return wp.vec4(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h, cell.probability / _solid_angle(grid, cell.row))
+    phi = 2.0 * wp.pi * (float(cell.column) + cell.x) / float(distribution.columns)
+    return wp.vec4(
+        r * wp.cos(phi), r * wp.sin(phi), 1.0 - h, cell.probability / _cell_solid_angle(distribution, cell.row)
+    )
 
 
 @wp.func
-def direction_uv(grid: Grid, d: wp.vec3) -> wp.vec2:
-    """Column and row, with fractions, of a unit direction around +z."""
+def texel_coordinates(distribution: Distribution2D, d: wp.vec3) -> wp.vec2:
+    """Column and row, with fractions, at which a unit direction around +z lies."""
     theta = wp.atan2(wp.sqrt(d[0] * d[0] + d[1] * d[1]), d[2])
     phi = wp.atan2(d[1], d[0])
-    turn = phi / (2.0 * wp.pi)
-    if turn < 0.0:
-        turn += 1.0
-    return wp.vec2(turn * float(grid.columns), theta / grid.theta * float(grid.rows))
+    revolutions = phi / (2.0 * wp.pi)
+    if revolutions < 0.0:
+        revolutions += 1.0
+    return wp.vec2(revolutions * float(distribution.columns), theta / distribution.max_theta * float(distribution.rows))
 
 
 @wp.func(inline=False)
 def direction_pdf(tables: Distribution2DTables, index: int, d: wp.vec3) -> float:
-    """The density per solid angle with which `cell_direction` gives a unit direction."""
-    grid = tables.distributions[index]
-    place = direction_uv(grid, d)
-    row = wp.clamp(int(place[1]), 0, grid.rows - 1)
-    return _cell_probability(tables, grid, row, wp.clamp(int(place[0]), 0, grid.columns - 1)) / _solid_angle(grid, row)
+    """The pdf per solid angle with which `cell_direction` samples a unit direction."""
+    distribution = tables.distributions[index]
+    texel = texel_coordinates(distribution, d)
+    row = wp.clamp(int(texel[1]), 0, distribution.rows - 1)
+    return _cell_probability(
+        tables, distribution, row, wp.clamp(int(texel[0]), 0, distribution.columns - 1)
+    ) / _cell_solid_angle(distribution, row)
 
 
 @wp.func(inline=False)
-def uv_pdf(tables: Distribution2DTables, index: int, u: wp.vec2) -> float:
-    """The density of the samples at a place u in [0, 1]² of a rectangle, relative to uniform ones."""
-    grid = tables.distributions[index]
-    row = wp.clamp(int(u[1] * float(grid.rows)), 0, grid.rows - 1)
-    column = wp.clamp(int(u[0] * float(grid.columns)), 0, grid.columns - 1)
-    return _cell_probability(tables, grid, row, column) * float(grid.rows) * float(grid.columns)
+def uv_pdf(tables: Distribution2DTables, index: int, uv: wp.vec2) -> float:
+    """The pdf per du dv of the samples of a rectangle at uv coordinates in [0, 1]²."""
+    distribution = tables.distributions[index]
+    row = wp.clamp(int(uv[1] * float(distribution.rows)), 0, distribution.rows - 1)
+    column = wp.clamp(int(uv[0] * float(distribution.columns)), 0, distribution.columns - 1)
+    return _cell_probability(tables, distribution, row, column) * float(distribution.rows) * float(distribution.columns)
 
 
 @wp.func
-def cell_uv(tables: Distribution2DTables, index: int, cell: Cell) -> wp.vec2:
-    """The place u in [0, 1]² of a rectangle."""
-    grid = tables.distributions[index]
-    return wp.vec2((float(cell.column) + cell.x) / float(grid.columns), (float(cell.row) + cell.y) / float(grid.rows))
+def cell_uv(tables: Distribution2DTables, index: int, cell: CellSample) -> wp.vec2:
+    """The uv coordinates in [0, 1]² of a sample of a rectangle."""
+    distribution = tables.distributions[index]
+    return wp.vec2(
+        (float(cell.column) + cell.x) / float(distribution.columns),
+        (float(cell.row) + cell.y) / float(distribution.rows),
+    )
 
 
 @wp.func
-def _texel(tables: Distribution2DTables, grid: Grid, row: int, column: int) -> wp.vec3:
-    r = wp.clamp(row, 0, grid.rows - 1)
-    c = wp.clamp(column, 0, grid.columns - 1)
-    if grid.theta > 0.0:  # all the way round
-        c = ((column % grid.columns) + grid.columns) % grid.columns
-    return tables.texels[grid.texels + r * grid.columns + c]
+def _texel(tables: Distribution2DTables, distribution: Distribution2D, row: int, column: int) -> wp.vec3:
+    """The value of a cell; outside the table that of the nearest cell."""
+    r = wp.clamp(row, 0, distribution.rows - 1)
+    c = wp.clamp(column, 0, distribution.columns - 1)
+    if distribution.max_theta > 0.0:  # the azimuth is periodic
+        c = ((column % distribution.columns) + distribution.columns) % distribution.columns
+    return tables.texels[distribution.texels + r * distribution.columns + c]
 
 
 @wp.func(inline=False)
-def interpolate(tables: Distribution2DTables, index: int, place: wp.vec2) -> wp.vec3:
-    """The value at a column and row with fractions, bilinear between the centres of cells."""
-    grid = tables.distributions[index]
-    x = place[0] - 0.5
-    y = place[1] - 0.5
+def interpolate(tables: Distribution2DTables, index: int, texel: wp.vec2) -> wp.vec3:
+    """The value at a column and row with fractions, interpolated bilinearly between the centres of cells."""
+    distribution = tables.distributions[index]
+    x = texel[0] - 0.5
+    y = texel[1] - 0.5
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - float(column)
     fy = y - float(row)
-    upper = wp.lerp(_texel(tables, grid, row, column), _texel(tables, grid, row, column + 1), fx)
-    lower = wp.lerp(_texel(tables, grid, row + 1, column), _texel(tables, grid, row + 1, column + 1), fx)
+    upper = wp.lerp(_texel(tables, distribution, row, column), _texel(tables, distribution, row, column + 1), fx)
+    lower = wp.lerp(
+        _texel(tables, distribution, row + 1, column), _texel(tables, distribution, row + 1, column + 1), fx
+    )
     return wp.lerp(upper, lower, fy)
 
 
 @wp.func
-def value_at_uv(tables: Distribution2DTables, index: int, u: wp.vec2) -> wp.vec3:
-    """The value at a place u in [0, 1]² of a rectangle."""
-    grid = tables.distributions[index]
-    return interpolate(tables, index, wp.vec2(u[0] * float(grid.columns), u[1] * float(grid.rows)))
+def value_at_uv(tables: Distribution2DTables, index: int, uv: wp.vec2) -> wp.vec3:
+    """The value of a rectangle at uv coordinates in [0, 1]²."""
+    distribution = tables.distributions[index]
+    return interpolate(tables, index, wp.vec2(uv[0] * float(distribution.columns), uv[1] * float(distribution.rows)))
 
 
 @wp.func
-def value_along(tables: Distribution2DTables, index: int, d: wp.vec3) -> wp.vec3:
-    """The value along a unit direction around +z."""
-    return interpolate(tables, index, direction_uv(tables.distributions[index], d))
+def value_at_direction(tables: Distribution2DTables, index: int, d: wp.vec3) -> wp.vec3:
+    """The value in a unit direction around +z."""
+    return interpolate(tables, index, texel_coordinates(tables.distributions[index], d))
 
 
 @dataclass(frozen=True, eq=False)
-class _Values:
-    """A grid on the host."""
+class _HostDistribution:
+    """The arguments of `Distribution2DList.add`."""
 
-    values: Any
-    theta: float
-    weights: Any
-    keep: bool
+    values: Floats
+    max_theta: float
+    weights: Floats | None
+    store_values: bool
 
-    def equals(self, other: "_Values") -> bool:
-        """Whether it is surely the same; large values are compared as objects."""
-        return (self.theta, self.keep) == (other.theta, other.keep) and all(
-            a is b or (a is not None and b is not None and max(a.size, b.size) <= _COMPARED and np.array_equal(a, b))
+    def equals(self, other: "_HostDistribution") -> bool:
+        """Whether the tables are certainly equal: large ones only if they are the same objects."""
+        return (self.max_theta, self.store_values) == (other.max_theta, other.store_values) and all(
+            a is b
+            or (a is not None and b is not None and max(a.size, b.size) <= _MAX_COMPARED_SIZE and np.array_equal(a, b))
             for a, b in ((self.values, other.values), (self.weights, other.weights))
         )
 
 
 class Distribution2DList:
-    """Grids on the host, to be uploaded together."""
+    """Distributions on the host, to be uploaded together."""
 
-    def __init__(self, former: Sequence["Distribution2DList"] = ()) -> None:
-        """An empty list; if it comes to equal one of `former` ones, that one's tables are taken."""
-        self._former = former
-        self._grids: list[_Values] = []
-        self._tables: Any = None
+    def __init__(self, previous: Sequence["Distribution2DList"] = ()) -> None:
+        """Creates an empty list; `upload` reuses the tables of a list in `previous` with equal contents."""
+        self._previous = previous
+        self._distributions: list[_HostDistribution] = []
+        self._tables: Distribution2DTables | None = None
 
-    def add(self, values: Any, *, theta: float = 0.0, weights: Any = None, keep: bool = True) -> int:
-        """Adds a grid and returns its index.
+    def add(
+        self, values: Floats, *, max_theta: float = 0.0, weights: Floats | None = None, store_values: bool = True
+    ) -> int:
+        """Adds a distribution and returns its index.
 
         Args:
-            values: [rows, columns, 3], not negative; not to be changed any more.
-            theta: Polar angle at which the last row ends [rad]; 0: over a rectangle.
-            weights: [rows, columns], with which cells are drawn; None: the integral over the cell of the mean channel.
-            keep: Whether the values will be looked up.
+            values: [rows, columns, 3], not negative; must not change afterwards.
+            max_theta: Polar angle at which the last row ends [rad]; 0: over a rectangle.
+            weights: [rows, columns], relative probabilities of the cells; None: the integral over the cell of the mean
+                of the channels.
+            store_values: Whether kernels look the values up; otherwise only the CDFs are uploaded.
         """
-        self._grids.append(_Values(values, theta, weights, keep))
-        return len(self._grids) - 1
+        self._distributions.append(_HostDistribution(values, max_theta, weights, store_values))
+        return len(self._distributions) - 1
 
-    def upload(self, launcher: Launcher) -> Any:
-        """The `Distribution2DTables`; one unused row where there is nothing, since kernels never get a null pointer."""
+    def upload(self, launcher: Launcher) -> Distribution2DTables:
+        """The tables on the device; an empty list has one unused row, since kernels never get a null pointer."""
         if self._tables is None:
-            self._tables = next((f._tables for f in self._former if self._equals(f)), None) or self._upload(launcher)
-            self._former = ()
+            reused = next((p._tables for p in self._previous if self._equals(p)), None)
+            self._tables = reused or self._upload(launcher)
+            self._previous = ()
         return self._tables
 
     def _equals(self, other: "Distribution2DList") -> bool:
-        return len(self._grids) == len(other._grids) and all(
-            mine.equals(its) for mine, its in zip(self._grids, other._grids, strict=True)
+        return len(self._distributions) == len(other._distributions) and all(
+            a.equals(b) for a, b in zip(self._distributions, other._distributions, strict=True)
         )
 
-    def _upload(self, launcher: Launcher) -> Any:
-        table = np.zeros(max(len(self._grids), 1), Grid.numpy_dtype())
-        cdf, texels = [np.zeros(0 if self._grids else 1, np.float32)], [np.zeros((0, 3), np.float32)]
+    def _upload(self, launcher: Launcher) -> Distribution2DTables:
+        table = np.zeros(max(len(self._distributions), 1), Distribution2D.numpy_dtype())
+        cdf, texels = [np.zeros(0 if self._distributions else 1, np.float32)], [np.zeros((0, 3), np.float32)]
         cdf_length = texels_length = 0
-        for k, grid in enumerate(self._grids):
-            rows, columns = grid.values.shape[:2]
-            weights = grid.weights
+        for k, distribution in enumerate(self._distributions):
+            rows, columns = distribution.values.shape[:2]
+            weights = distribution.weights
             if weights is None:
-                weights = cell_means(grid.values.mean(axis=2), around=grid.theta > 0.0)
-                weights = weights * cell_measure(rows, grid.theta)[:, None]
-            table[k] = (rows, columns, cdf_length, texels_length, grid.theta)
-            cdf.append(_cumulative(weights))
+                weights = cell_means(distribution.values.mean(axis=2), periodic=distribution.max_theta > 0.0)
+                weights = weights * row_areas(rows, distribution.max_theta)[:, None]
+            table[k] = (rows, columns, cdf_length, texels_length, distribution.max_theta)
+            cdf.append(_nested_cdf(weights))
             cdf_length += len(cdf[-1])
-            if grid.keep:
-                texels.append(grid.values.reshape(-1, 3).astype(np.float32))
+            if distribution.store_values:
+                texels.append(distribution.values.reshape(-1, 3).astype(np.float32))
                 texels_length += rows * columns
         out = Distribution2DTables()
-        out.distributions = launcher.array(table, Grid)
+        out.distributions = launcher.array(table, Distribution2D)
         out.cdf = launcher.array(np.concatenate(cdf), wp.float32)
         out.texels = launcher.array(np.concatenate(texels) if texels_length else np.zeros((1, 3)), wp.vec3)
         return out
 
 
-def cell_measure(rows: int, theta: float) -> npt.NDArray[np.float64]:
-    """Part of the whole rectangle, or the solid angle, of a row of cells; float64 [rows]."""
-    if theta == 0.0:
+def row_areas(rows: int, max_theta: float) -> npt.NDArray[np.float64]:
+    """Summed area of the cells of each row, float64 [rows]: of the unit square, or a solid angle [sr]."""
+    if max_theta == 0.0:
         return np.full(rows, 1.0 / rows)
-    edges = 2.0 * np.sin(0.5 * theta * np.arange(rows + 1) / rows) ** 2
+    edges = 2.0 * np.sin(0.5 * max_theta * np.arange(rows + 1) / rows) ** 2
     return 2.0 * np.pi * np.diff(edges)
 
 
-def cell_means(values: Any, *, around: bool) -> npt.NDArray[np.float64]:
-    """The means of a bilinear interpolation over its cells: what lies between the centres reaches half a cell on.
+def cell_means(values: Floats, *, periodic: bool) -> npt.NDArray[np.float64]:
+    """Means of the bilinear interpolation over each cell, to which the neighbours' values contribute.
 
     Args:
         values: [rows, columns], at the centres of the cells.
-        around: Whether the last column is followed by the first.
+        periodic: Whether the last column is followed by the first.
     """
     out = np.pad(np.asarray(values, np.float64), ((1, 1), (0, 0)), mode="edge")
     out = 0.125 * (out[:-2] + 6.0 * out[1:-1] + out[2:])
-    out = np.pad(out, ((0, 0), (1, 1)), mode="wrap" if around else "edge")
+    out = np.pad(out, ((0, 0), (1, 1)), mode="wrap" if periodic else "edge")
     return 0.125 * (out[:, :-2] + 6.0 * out[:, 1:-1] + out[:, 2:])
 
 
-def _cumulative(weights: Any) -> npt.NDArray[np.float32]:
-    """Cumulative probabilities of the rows [rows + 1] and, one after the other, of the cells of each [columns + 1]."""
+def _nested_cdf(weights: Floats) -> npt.NDArray[np.float32]:
+    """The CDF of the rows [rows + 1], followed by that of the cells of each row [columns + 1]."""
     rows, columns = weights.shape
     weights = np.asarray(weights, np.float64)
     if weights.max() > 0.0:
         weights = weights / weights.max()
-        lit = weights > 0.0
-        weights = (1.0 - _EVENLY) * weights / weights.sum() + _EVENLY * lit / lit.sum()
+        positive = weights > 0.0
+        weights = (1.0 - _UNIFORM_FRACTION) * weights / weights.sum() + _UNIFORM_FRACTION * positive / positive.sum()
     out = np.zeros(rows + 1 + rows * (columns + 1), np.float32)
-    out[: rows + 1] = _steps(weights.sum(axis=1)[None])[0]
-    out[rows + 1 :] = _steps(weights).reshape(-1)
+    out[: rows + 1] = _cdf(weights.sum(axis=1)[None])[0]
+    out[rows + 1 :] = _cdf(weights).reshape(-1)
     return out
 
 
-def _steps(weights: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Cumulative sums [n, k + 1] of rows [n, k], from 0 to 1, in steps that a sample number can take."""
+def _cdf(weights: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """CDFs [n, k + 1] of rows of weights [n, k], rounded to multiples of 1/_CDF_STEPS."""
     sums = np.cumsum(weights, axis=1)
     total = np.where(sums[:, -1:] > 0.0, sums[:, -1:], 1.0)
     out = np.zeros((len(weights), weights.shape[1] + 1), np.float32)
-    out[:, 1:] = np.round(sums / total * _STEPS) / _STEPS
+    out[:, 1:] = np.round(sums / total * _CDF_STEPS) / _CDF_STEPS
     out[:, -1] = 1.0
     return out

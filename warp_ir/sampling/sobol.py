@@ -1,9 +1,9 @@
 """Low-discrepancy samples as a pure function of (index, dimension, scramble).
 
-Sobol' points (direction numbers of Joe and Kuo 2008, in their order) with Owen's nested uniform scrambling,
-done by a hash of the bit-reversed digits (Laine and Karras 2011; Burley 2020; constants of Vegdahl 2021).
-Every prefix of 2^k points is stratified in each dimension, exactly; two scrambles are independent
-estimates. There is no state: the same arguments give the same number on any thread of any machine.
+The points are Sobol's (direction numbers of Joe and Kuo 2008, in their order) with Owen scrambling, computed by a hash
+of the bit-reversed digits (Laine and Karras 2011; Burley 2020; constants of Vegdahl 2021). Every prefix of 2^k points
+is exactly stratified in each dimension; estimates of different scrambles are independent. The sampler is stateless:
+equal arguments give equal numbers on any thread of any machine.
 """
 
 from functools import cache
@@ -33,9 +33,9 @@ _JOE_KUO = (
     (6, 16, (1, 3, 1, 13, 27, 49)),
 )
 SOBOL_DIMENSIONS = len(_JOE_KUO) + 1
-"""Dimensions that are one Sobol' sequence; beyond them, the sequence is shuffled and used again."""
+"""Dimensions of one Sobol' sequence; higher dimensions use the same sequence in a shuffled order (padding)."""
 
-_TIME = wp.constant(4)  # after the place in the pixel and that on the lens
+_TIME_DIMENSION = wp.constant(4)  # after the pixel's two dimensions and the lens' two
 _DIMENSIONS = wp.constant(SOBOL_DIMENSIONS)
 _GOLDEN = wp.constant(wp.uint32(0x9E3779B9))
 _HASH_1 = wp.constant(wp.uint32(0x7FEB352D))
@@ -52,7 +52,7 @@ _MASK_8 = wp.constant(wp.uint32(0x00FF00FF))
 def sobol_matrices() -> npt.NDArray[np.uint32]:
     """Generator matrices, uint32 [SOBOL_DIMENSIONS * 32]: column k of dimension d is entry 32 d + k.
 
-    The lowest bit is the first binary digit of the sample (bit-reversed), which is what the scrambling wants.
+    The lowest bit is the first binary digit of the sample: bit-reversed, as Owen scrambling by hashing requires.
     """
     columns = np.zeros((SOBOL_DIMENSIONS, 32), dtype=np.uint32)
     columns[0] = 1 << np.arange(32, dtype=np.uint64)
@@ -68,20 +68,22 @@ def sobol_matrices() -> npt.NDArray[np.uint32]:
 
 
 def iteration_scramble(seed: int, iteration: int) -> int:
-    """The scramble of one iteration of a render: iterations and seeds are independent of each other."""
+    """The scramble of one iteration of a render; different iterations and seeds have independent scrambles."""
     words = np.random.SeedSequence([seed, iteration]).generate_state(1, np.uint32)
     return int(words[0])
 
 
 @cache
 def _time_columns() -> tuple[int, ...]:
-    return tuple(int(x) for x in sobol_matrices().reshape(-1, 32)[_TIME])
+    """Columns of the time dimension's generator matrix, as Python integers."""
+    return tuple(int(x) for x in sobol_matrices().reshape(-1, 32)[_TIME_DIMENSION])
 
 
 def stratum(iteration: int, bits: int) -> int:
-    """Which of 2^bits parts of the time an iteration is for: 2^bits that begin at a multiple of that take all in turn.
+    """The stratum of the shutter interval, of 2^bits, that an iteration samples.
 
-    It has a dimension of its own beside those of the camera: what is sampled together must not go hand in hand.
+    Every aligned run of 2^bits iterations visits each stratum once. Time has a dimension of the sequence of its own, so
+    that it does not correlate with the camera's samples.
     """
     x = 0
     for k, column in enumerate(_time_columns()):
@@ -92,7 +94,7 @@ def stratum(iteration: int, bits: int) -> int:
 
 @wp.func
 def hash_combine(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """A new 32-bit scramble from two (the finalizer of Wellons' lowbias32)."""
+    """A 32-bit hash of two words (the finalizer of Wellons' lowbias32)."""
     x = a ^ (b * _GOLDEN + _GOLDEN)
     x = (x ^ (x >> wp.uint32(16))) * _HASH_1
     x = (x ^ (x >> wp.uint32(15))) * _HASH_2
@@ -101,6 +103,7 @@ def hash_combine(a: wp.uint32, b: wp.uint32) -> wp.uint32:
 
 @wp.func
 def _reverse_bits(x: wp.uint32) -> wp.uint32:
+    """The 32 bits in reverse order."""
     y = ((x >> wp.uint32(1)) & _MASK_1) | ((x & _MASK_1) << wp.uint32(1))
     y = ((y >> wp.uint32(2)) & _MASK_2) | ((y & _MASK_2) << wp.uint32(2))
     y = ((y >> wp.uint32(4)) & _MASK_4) | ((y & _MASK_4) << wp.uint32(4))
@@ -110,10 +113,10 @@ def _reverse_bits(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def stratum_at(matrices: wp.array[wp.uint32], iteration: int, bits: int) -> int:
-    """The same as `stratum`."""
+    """`stratum` on the device."""
     i = wp.uint32(iteration)
     x = wp.uint32(0)
-    column = 32 * _TIME
+    column = 32 * _TIME_DIMENSION
     while i != wp.uint32(0):
         if (i & wp.uint32(1)) != wp.uint32(0):
             x = x ^ matrices[column]
@@ -126,7 +129,7 @@ def stratum_at(matrices: wp.array[wp.uint32], iteration: int, bits: int) -> int:
 
 @wp.func
 def _permute_reversed(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """Owen's scrambling of a bit-reversed number: each bit is flipped depending on the bits below it."""
+    """Owen scrambling of a bit-reversed number: each bit is flipped depending on the bits below it."""
     y = x ^ (x * _OWEN_1)
     y = (y + seed) * ((seed >> wp.uint32(16)) | wp.uint32(1))
     y = y ^ (y * _OWEN_2)
@@ -134,10 +137,10 @@ def _permute_reversed(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def _seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
-    """Independent seeds of the permutations of one scramble.
+def _permutation_seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
+    """The seed of one permutation (`stream`) of a scramble; seeds of different streams are independent.
 
-    Two rounds: after one, seeds of two streams still hang together over the scrambles, and so would the
+    It takes two rounds of hashing: after one, the seeds of two streams correlate over the scrambles, and so would the
     coordinates of a point.
     """
     return hash_combine(hash_combine(scramble, stream), scramble)
@@ -145,28 +148,28 @@ def _seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
 
 @wp.func
 def to_unit(bits: wp.uint32) -> float:
-    """Random bits as a number in [0, 1)."""
+    """Maps 32 random bits to [0, 1), using the upper 24."""
     return float(bits >> wp.uint32(8)) * 5.9604644775390625e-08  # 2⁻²⁴
 
 
-@wp.func(inline=False)  # kernels ask for a dozen
+@wp.func(inline=False)  # a kernel draws a dozen samples: inlined, each would be compiled
 def sample_1d(matrices: wp.array[wp.uint32], index: int, dimension: int, scramble: wp.uint32) -> float:
-    """Coordinate `dimension` of point `index` of the sequence `scramble`, in [0, 1)."""
+    """Coordinate `dimension` of point `index` of the sequence with this scramble, in [0, 1)."""
     i = wp.uint32(index)
     d = dimension
     if dimension >= _DIMENSIONS:
-        # Padding: the same dimensions in an order shuffled by another nested permutation (Burley 2020).
+        # Padding: the same dimensions, in an order shuffled by a nested permutation of its own (Burley 2020).
         d = dimension % _DIMENSIONS
-        shuffle = _seed(scramble, ~wp.uint32(dimension // _DIMENSIONS))
+        shuffle = _permutation_seed(scramble, ~wp.uint32(dimension // _DIMENSIONS))
         i = _reverse_bits(_permute_reversed(_reverse_bits(i), shuffle))
     x = wp.uint32(0)
     column = 32 * d
     while i != wp.uint32(0):
-        # No branch on bits that nobody can predict.
+        # Branchless: the bits are unpredictable.
         x = x ^ (matrices[column] & (wp.uint32(0) - (i & wp.uint32(1))))
         i = i >> wp.uint32(1)
         column += 1
-    x = _reverse_bits(_permute_reversed(x, _seed(scramble, wp.uint32(dimension))))
+    x = _reverse_bits(_permute_reversed(x, _permutation_seed(scramble, wp.uint32(dimension))))
     return to_unit(x)
 
 

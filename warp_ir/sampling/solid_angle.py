@@ -1,12 +1,12 @@
-"""Directions towards a light with an area, and their density per solid angle as a point sees it.
+"""Sampling of directions from a point towards an area light, and their pdf per solid angle.
 
-Points sampled by area are bad when a light is near: most of what arrives comes from a small part of it. Here spheres
-are sampled as the cone that they fill (Shirley et al. 1996), rectangles nearby evenly per solid angle (Ureña et al.
-2013, An Area-Preserving Parametrization for Spherical Rectangles), disks nearby as the square around them, and
-cylinders evenly in the angle around their axis and in the sine of the angle along it, which together are a measure of
-solid angle as well (Archimedes); flat lights that are far, by area. Lights that are scaled or sheared are sampled in a
-space where they are not: a linear map A changes solid angles by |A d|³ / |det A|. No difference of nearly equal numbers
-decides how bright anything is, however small, large, near or far the light.
+Sampling a near light by area is noisy: most of its irradiance comes from a small part of it. Spheres are sampled as the
+cone that they subtend (Shirley et al. 1996); near rectangles uniformly per solid angle (Ureña et al. 2013, An
+Area-Preserving Parametrization for Spherical Rectangles); near disks by the square around them; cylinders uniformly in
+the azimuth around their axis and in the sine of the elevation along it, the product of which measures solid angle
+(Archimedes); distant flat lights by area. Scaled or sheared lights are sampled in a canonical space where they are
+neither: a linear map A changes solid angles by |A d|³ / |det A|. No result depends on the difference of nearly equal
+numbers, however small, large, near or far the light.
 """
 
 import warp as wp
@@ -19,81 +19,85 @@ wp.set_module_options({"enable_backward": False})
 _RECT = wp.constant(int(LightKind.RECT))
 _DISK = wp.constant(int(LightKind.DISK))
 _SPHERE = wp.constant(int(LightKind.SPHERE))
-_NEAR_DISK = wp.constant(1.5)  # squared distance within which a disk of radius 1 is sampled as its square
-_LEAST_ANGLE = wp.constant(1.0e-2)  # [sr], below which a difference of angles tells too little
+_NEAR_DISK = wp.constant(1.5)  # squared distance within which a disk of radius 1 is sampled by the square around it
+_MIN_SOLID_ANGLE = wp.constant(1.0e-2)  # [sr], below which the difference of arctangents loses too many digits
 
 
 @wp.struct
-class Aim:
-    """A sampled way from a point to a light."""
+class DirectionSample:
+    """A sampled direction from a point towards a light."""
 
-    way: wp.vec3  # to where the light emits towards the point
-    pdf: float  # of its direction, per solid angle; 0: nothing arrives this way
+    offset: wp.vec3  # from the point to the sampled point on the light
+    pdf: float  # per solid angle; 0: the light does not emit towards the point in this direction
 
 
 @wp.struct
-class _Space:
-    """Where a light is a rectangle, the unit disk or sphere or a cylinder of radius 1, and little else is bent."""
+class _CanonicalSpace:
+    """A space where the light is a rectangle, the unit disk, the unit sphere or a cylinder of radius 1.
 
-    scale: wp.vec3  # coordinates there over those in the light's unit space
-    volume_root: float  # ∛|det A|, A leading from there to the world
-    centre: wp.vec3  # of the light as the point sees it
+    The map A from it to the world is as close to a rotation as the light's shape allows.
+    """
+
+    scale: wp.vec3  # canonical coordinates over coordinates in the light's unit space
+    cbrt_det: float  # ∛|det A|
+    centre: wp.vec3  # of the light, relative to the point
 
 
 @wp.func
-def _space(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3) -> _Space:
+def _canonical_space(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3) -> _CanonicalSpace:
+    """The canonical space of a light; arguments as for `sample_solid_angle`."""
     x = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
     y = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
     z = wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2])
-    out = _Space()
+    out = _CanonicalSpace()
     out.scale = wp.vec3(1.0)
     if kind == _RECT or kind == _DISK:
         area = wp.length(wp.cross(x, y))
         if kind == _RECT:
             out.scale = wp.vec3(wp.length(x), area / wp.length(x), wp.length(z))
-            out.volume_root = 1.0
+            out.cbrt_det = 1.0
         else:
-            out.volume_root = wp.sqrt(area)
-            out.scale = wp.vec3(1.0, 1.0, wp.length(z) / out.volume_root)
+            out.cbrt_det = wp.sqrt(area)
+            out.scale = wp.vec3(1.0, 1.0, wp.length(z) / out.cbrt_det)
     else:
         if kind != _SPHERE:
             out.scale = wp.vec3(wp.length(x) / wp.sqrt(wp.length(wp.cross(y, z))), 1.0, 1.0)
-        out.volume_root = wp.cbrt(wp.abs(wp.determinant(axes)) / out.scale[0])
+        out.cbrt_det = wp.cbrt(wp.abs(wp.determinant(axes)) / out.scale[0])
     out.centre = wp.cw_mul(out.scale, inverse * to_light)
     return out
 
 
 @wp.func(inline=False)
-def sample_solid_angle(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, u: wp.vec2) -> Aim:
-    """A random way to a light.
+def sample_solid_angle(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, u: wp.vec2) -> DirectionSample:
+    """Samples a direction from a point towards a light.
 
     Args:
         kind: RECT, DISK, SPHERE or CYLINDER.
-        axes: Columns: what the axes of the unit shape become.
-        inverse: Of `axes`.
+        axes: Columns: the images of the unit shape's axes.
+        inverse: The inverse of `axes`.
         to_light: From the point to the light's origin.
-        u: In [0, 1)².
+        u: Sample in [0, 1)².
     """
-    space = _space(kind, axes, inverse, to_light)
-    found = Aim()
+    space = _canonical_space(kind, axes, inverse, to_light)
+    sample = DirectionSample()
     if kind == _RECT or kind == _DISK:
-        found = _sample_flat(kind, space, u)
+        sample = _sample_flat(kind, space, u)
     elif kind == _SPHERE:
-        found = _sample_sphere(space.centre, u)
+        sample = _sample_sphere(space.centre, u)
     else:
-        found = _sample_cylinder(space, u)
-    if found.pdf > 0.0:
-        p = found.way
-        found.way = axes * wp.cw_div(p, space.scale)
-        stretched = wp.length(found.way) / (wp.length(p) * space.volume_root)
-        found.pdf *= stretched * stretched * stretched
-    return found
+        sample = _sample_cylinder(space, u)
+    if sample.pdf > 0.0:
+        p = sample.offset
+        sample.offset = axes * wp.cw_div(p, space.scale)
+        stretch = wp.length(sample.offset) / (wp.length(p) * space.cbrt_det)
+        sample.pdf *= stretch * stretch * stretch
+    return sample
 
 
 @wp.func(inline=False)
 def solid_angle_pdf(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.vec3, direction: wp.vec3) -> float:
-    """The density with which `sample_solid_angle` gives a unit direction that meets the emitting side of the light."""
-    space = _space(kind, axes, inverse, to_light)
+    """The pdf per solid angle of `sample_solid_angle` for a unit direction that meets the light's emitting side."""
+    space = _canonical_space(kind, axes, inverse, to_light)
     d = wp.cw_mul(space.scale, inverse * direction)
     pdf = float(0.0)
     if kind == _RECT or kind == _DISK:
@@ -102,137 +106,142 @@ def solid_angle_pdf(kind: int, axes: wp.mat33, inverse: wp.mat33, to_light: wp.v
         pdf = _sphere_pdf(space.centre)
     else:
         pdf = _cylinder_pdf(space, d)
-    stretched = 1.0 / (wp.length(d) * space.volume_root)
-    return pdf * stretched * stretched * stretched
+    stretch = 1.0 / (wp.length(d) * space.cbrt_det)
+    return pdf * stretch * stretch * stretch
 
 
 @wp.func
-def _one_minus_cos(centre: wp.vec3) -> float:
-    """Of the angular radius of the unit sphere; the point is outside."""
+def _one_minus_cos_radius(centre: wp.vec3) -> float:
+    """1 - cosθ of the angular radius θ of the unit sphere around `centre`; the origin is outside."""
     squared = wp.dot(centre, centre)
     return 1.0 / (squared * (1.0 + wp.sqrt((squared - 1.0) / squared)))
 
 
 @wp.func
-def _sample_sphere(centre: wp.vec3, u: wp.vec2) -> Aim:
-    out = Aim()
+def _sample_sphere(centre: wp.vec3, u: wp.vec2) -> DirectionSample:
+    """A direction uniform in the cone that the unit sphere around `centre` subtends."""
+    out = DirectionSample()
     squared = wp.dot(centre, centre)
     if not squared > 1.0:
         return out
     distance = wp.sqrt(squared)
-    whole = _one_minus_cos(centre)
-    h = u[0] * whole  # 1 - cosθ
+    one_minus_cos = _one_minus_cos_radius(centre)
+    h = u[0] * one_minus_cos  # 1 - cosθ
     sine_squared = h * (2.0 - h)
     half_chord = wp.sqrt(wp.max(0.0, 1.0 - sine_squared * squared))
     t = (squared - 1.0) / (distance * (1.0 - h) + half_chord)
     r = wp.sqrt(sine_squared)
     phi = 2.0 * wp.pi * u[1]
-    around = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h)
-    out.way = t * from_local(around, centre / distance)
-    out.pdf = 1.0 / (2.0 * wp.pi * whole)
+    local = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 1.0 - h)
+    out.offset = t * from_local(local, centre / distance)
+    out.pdf = 1.0 / (2.0 * wp.pi * one_minus_cos)
     return out
 
 
 @wp.func
 def _sphere_pdf(centre: wp.vec3) -> float:
+    """The pdf of `_sample_sphere`, the same for all its directions."""
     if not wp.dot(centre, centre) > 1.0:
         return 0.0
-    return 1.0 / (2.0 * wp.pi * _one_minus_cos(centre))
+    return 1.0 / (2.0 * wp.pi * _one_minus_cos_radius(centre))
 
 
 @wp.func
-def _half(kind: int, space: _Space) -> wp.vec2:
-    """Half the sides of a rectangle, or of the square around a disk."""
+def _half_sides(kind: int, space: _CanonicalSpace) -> wp.vec2:
+    """Half the side lengths of a rectangle, or of the square around a disk."""
     if kind == _DISK:
         return wp.vec2(1.0, 1.0)
     return wp.vec2(0.5 * space.scale[0], 0.5 * space.scale[1])
 
 
 @wp.func
-def _corner(x: float, y: float, z: float) -> float:
-    """Solid angle of the rectangle from (0, 0) to (x, y) at a distance z > 0, signed like x y."""
+def _corner_solid_angle(x: float, y: float, z: float) -> float:
+    """Solid angle of the rectangle from (0, 0) to (x, y) at a distance z > 0, with the sign of x y."""
     return wp.atan2(x * y, z * wp.sqrt(x * x + y * y + z * z))
 
 
 @wp.func
-def _rectangle_angle(low: wp.vec2, high: wp.vec2, z: float) -> float:
+def _rectangle_solid_angle(low: wp.vec2, high: wp.vec2, z: float) -> float:
     """Solid angle of a rectangle at a distance z > 0."""
-    right = _corner(high[0], high[1], z) - _corner(high[0], low[1], z)
-    return right - _corner(low[0], high[1], z) + _corner(low[0], low[1], z)
+    right = _corner_solid_angle(high[0], high[1], z) - _corner_solid_angle(high[0], low[1], z)
+    return right - _corner_solid_angle(low[0], high[1], z) + _corner_solid_angle(low[0], low[1], z)
 
 
 @wp.func
-def _nearby(kind: int, centre: wp.vec3, half: wp.vec2) -> bool:
-    """Whether sampling a flat light by its area would be noisy."""
-    reach = wp.where(kind == _DISK, _NEAR_DISK, 4.0 * wp.length_sq(half))
-    return wp.length_sq(centre) < reach
+def _is_near(kind: int, centre: wp.vec3, half: wp.vec2) -> bool:
+    """Whether a flat light is so near that sampling it by area would be noisy."""
+    near_distance_squared = wp.where(kind == _DISK, _NEAR_DISK, 4.0 * wp.length_sq(half))
+    return wp.length_sq(centre) < near_distance_squared
 
 
 @wp.func
 def _area(kind: int, half: wp.vec2) -> float:
+    """Area of a rectangle or of the unit disk."""
     return wp.where(kind == _DISK, wp.pi, 4.0 * half[0] * half[1])
 
 
 @wp.func
-def _sample_flat(kind: int, space: _Space, u: wp.vec2) -> Aim:
-    out = Aim()
+def _sample_flat(kind: int, space: _CanonicalSpace, u: wp.vec2) -> DirectionSample:
+    """A direction towards a rectangle or a disk: by solid angle if it is near, else by area."""
+    out = DirectionSample()
     z = -space.centre[2]  # the light shines along +z
     if not z > 0.0:
         return out
     centre = wp.vec2(space.centre[0], space.centre[1])
-    half = _half(kind, space)
+    half = _half_sides(kind, space)
     low = centre - half
     high = centre + half
-    angle = float(0.0)
-    if _nearby(kind, space.centre, half):
-        angle = _rectangle_angle(low, high, z)
-    if angle > _LEAST_ANGLE:
-        p = _in_rectangle(low, high, z, angle, u)
-        out.way = wp.vec3(p[0], p[1], -z)
+    solid_angle = float(0.0)
+    if _is_near(kind, space.centre, half):
+        solid_angle = _rectangle_solid_angle(low, high, z)
+    if solid_angle > _MIN_SOLID_ANGLE:
+        p = _sample_spherical_rectangle(low, high, z, solid_angle, u)
+        out.offset = wp.vec3(p[0], p[1], -z)
         if kind == _RECT or wp.length_sq(p - centre) <= 1.0:
-            out.pdf = 1.0 / angle
+            out.pdf = 1.0 / solid_angle
         return out
     p = wp.vec2(wp.lerp(low[0], high[0], u[0]), wp.lerp(low[1], high[1], u[1]))
     if kind == _DISK:
         p = centre + square_to_disk(u)
-    out.way = wp.vec3(p[0], p[1], -z)
-    out.pdf = _per_area(out.way, _area(kind, half))
+    out.offset = wp.vec3(p[0], p[1], -z)
+    out.pdf = _area_to_solid_angle_pdf(out.offset, _area(kind, half))
     return out
 
 
 @wp.func
-def _per_area(way: wp.vec3, area: float) -> float:
-    """Density per solid angle of a point drawn evenly from an area across the z axis: d² / (A cosθ)."""
-    distance = wp.length(way)
-    return distance * distance * distance / (area * wp.abs(way[2]))
+def _area_to_solid_angle_pdf(offset: wp.vec3, area: float) -> float:
+    """Solid-angle pdf of a point sampled uniformly on an area A across the z axis: d² / (A cosθ)."""
+    distance = wp.length(offset)
+    return distance * distance * distance / (area * wp.abs(offset[2]))
 
 
 @wp.func
-def _flat_pdf(kind: int, space: _Space, d: wp.vec3) -> float:
+def _flat_pdf(kind: int, space: _CanonicalSpace, d: wp.vec3) -> float:
+    """The pdf of `_sample_flat` for a direction that hits the light."""
     z = -space.centre[2]
     if not (z > 0.0 and d[2] < 0.0):
         return 0.0
     centre = wp.vec2(space.centre[0], space.centre[1])
-    half = _half(kind, space)
-    if _nearby(kind, space.centre, half):
-        angle = _rectangle_angle(centre - half, centre + half, z)
-        if angle > _LEAST_ANGLE:
-            return 1.0 / angle
-    return _per_area(d * (z / -d[2]), _area(kind, half))
+    half = _half_sides(kind, space)
+    if _is_near(kind, space.centre, half):
+        solid_angle = _rectangle_solid_angle(centre - half, centre + half, z)
+        if solid_angle > _MIN_SOLID_ANGLE:
+            return 1.0 / solid_angle
+    return _area_to_solid_angle_pdf(d * (z / -d[2]), _area(kind, half))
 
 
 @wp.func
-def _in_rectangle(low: wp.vec2, high: wp.vec2, z: float, angle: float, u: wp.vec2) -> wp.vec2:
-    """A point of a rectangle at a distance z, uniform per solid angle; names of the paper."""
-    # x by the solid angle of what lies below it ...
-    au = u[0] * angle + wp.pi + _corner(low[0], high[1], z) - _corner(low[0], low[1], z)
+def _sample_spherical_rectangle(low: wp.vec2, high: wp.vec2, z: float, solid_angle: float, u: wp.vec2) -> wp.vec2:
+    """A point of a rectangle at a distance z, uniform per solid angle; variables are named as by Ureña et al."""
+    # x inverts the solid angle of the rectangle up to it ...
+    au = u[0] * solid_angle + wp.pi + _corner_solid_angle(low[0], high[1], z) - _corner_solid_angle(low[0], low[1], z)
     below = z * z + low[1] * low[1]
     b0 = -low[1] / wp.sqrt(below)
     b1 = high[1] / wp.sqrt(z * z + high[1] * high[1])
     fu = (wp.cos(au) * b0 - b1) / wp.sin(au)
     xu = z / wp.sqrt(wp.max(fu * fu - z * z / below, 1.0e-30))
     xu = wp.clamp(wp.where(fu < 0.0, -xu, xu), low[0], high[0])
-    # ... and y evenly in the sine of its angle.
+    # ... and y is uniform in the sine of its elevation.
     d = wp.sqrt(xu * xu + z * z)
     h = wp.lerp(low[1] / wp.sqrt(d * d + low[1] * low[1]), high[1] / wp.sqrt(d * d + high[1] * high[1]), u[1])
     yv = h * d / wp.sqrt(wp.max(1.0 - h * h, 1.0e-30))
@@ -240,8 +249,8 @@ def _in_rectangle(low: wp.vec2, high: wp.vec2, z: float, angle: float, u: wp.vec
 
 
 @wp.func
-def _sines(x0: float, x1: float, distance: float) -> float:
-    """The difference of the sines of the angles under which x0 < x1 on a line are seen from a distance."""
+def _sine_difference(x0: float, x1: float, distance: float) -> float:
+    """Sin of the elevation of x1 less that of x0 < x1, both on a line at a distance, without cancellation."""
     r0 = wp.sqrt(x0 * x0 + distance * distance)
     r1 = wp.sqrt(x1 * x1 + distance * distance)
     if x0 * x1 <= 0.0:
@@ -250,16 +259,18 @@ def _sines(x0: float, x1: float, distance: float) -> float:
 
 
 @wp.func
-def _to_wall(centre: wp.vec3, e: wp.vec2) -> float:
-    """Distance across the axis, in the unit direction `e`, to the near side of a cylinder of radius 1."""
-    across = wp.vec2(centre[1], centre[2])
-    aside = centre[1] * e[1] - centre[2] * e[0]
-    return (wp.dot(across, across) - 1.0) / (wp.dot(across, e) + wp.sqrt(wp.max(0.0, 1.0 - aside * aside)))
+def _distance_to_cylinder(centre: wp.vec3, e: wp.vec2) -> float:
+    """Distance in the unit direction `e` across the axis to the near side of a cylinder of radius 1."""
+    centre_2d = wp.vec2(centre[1], centre[2])
+    perpendicular = centre[1] * e[1] - centre[2] * e[0]
+    return (wp.dot(centre_2d, centre_2d) - 1.0) / (
+        wp.dot(centre_2d, e) + wp.sqrt(wp.max(0.0, 1.0 - perpendicular * perpendicular))
+    )
 
 
 @wp.func
-def _half_width(centre: wp.vec3) -> float:
-    """Half the angle around its axis that a cylinder of radius 1 fills; 0 from inside."""
+def _half_azimuth(centre: wp.vec3) -> float:
+    """Half the azimuth that a cylinder of radius 1 subtends across its axis; 0 from inside."""
     squared = centre[1] * centre[1] + centre[2] * centre[2]
     if not squared > 1.0:
         return 0.0
@@ -267,10 +278,11 @@ def _half_width(centre: wp.vec3) -> float:
 
 
 @wp.func
-def _sample_cylinder(space: _Space, u: wp.vec2) -> Aim:
-    out = Aim()
+def _sample_cylinder(space: _CanonicalSpace, u: wp.vec2) -> DirectionSample:
+    """A direction towards a cylinder, uniform in the azimuth and in the sine of the elevation."""
+    out = DirectionSample()
     centre = space.centre
-    half = _half_width(centre)
+    half = _half_azimuth(centre)
     if half == 0.0:
         return out
     psi = half * (2.0 * u[0] - 1.0)
@@ -278,23 +290,24 @@ def _sample_cylinder(space: _Space, u: wp.vec2) -> Aim:
     s = wp.sin(psi)
     to_axis = wp.normalize(wp.vec2(centre[1], centre[2]))
     e = wp.vec2(c * to_axis[0] - s * to_axis[1], s * to_axis[0] + c * to_axis[1])
-    distance = _to_wall(centre, e)
+    distance = _distance_to_cylinder(centre, e)
     x0 = centre[0] - 0.5 * space.scale[0]
     x1 = centre[0] + 0.5 * space.scale[0]
-    sines = _sines(x0, x1, distance)
-    h = x0 / wp.sqrt(x0 * x0 + distance * distance) + u[1] * sines
+    sine_difference = _sine_difference(x0, x1, distance)
+    h = x0 / wp.sqrt(x0 * x0 + distance * distance) + u[1] * sine_difference
     x = wp.clamp(h * distance / wp.sqrt(wp.max(1.0 - h * h, 1.0e-30)), x0, x1)
-    out.way = wp.vec3(x, distance * e[0], distance * e[1])
-    out.pdf = 1.0 / (2.0 * half * sines)
+    out.offset = wp.vec3(x, distance * e[0], distance * e[1])
+    out.pdf = 1.0 / (2.0 * half * sine_difference)
     return out
 
 
 @wp.func
-def _cylinder_pdf(space: _Space, d: wp.vec3) -> float:
-    half = _half_width(space.centre)
+def _cylinder_pdf(space: _CanonicalSpace, d: wp.vec3) -> float:
+    """The pdf of `_sample_cylinder` for a direction that hits the light."""
+    half = _half_azimuth(space.centre)
     if half == 0.0:
         return 0.0
-    distance = _to_wall(space.centre, wp.normalize(wp.vec2(d[1], d[2])))
+    distance = _distance_to_cylinder(space.centre, wp.normalize(wp.vec2(d[1], d[2])))
     x0 = space.centre[0] - 0.5 * space.scale[0]
     x1 = space.centre[0] + 0.5 * space.scale[0]
-    return 1.0 / (2.0 * half * _sines(x0, x1, distance))
+    return 1.0 / (2.0 * half * _sine_difference(x0, x1, distance))

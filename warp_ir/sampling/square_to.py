@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def from_local(v: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """`v` in an orthonormal frame with z along the unit vector `n` (Duff et al. 2017)."""
+    """Transforms `v` from an orthonormal frame whose z axis is the unit vector `n` (Duff et al. 2017)."""
     s = wp.where(n[2] >= 0.0, 1.0, -1.0)
     a = -1.0 / (s + n[2])
     b = n[0] * n[1] * a
@@ -18,7 +18,7 @@ def from_local(v: wp.vec3, n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def square_to_disk(u: wp.vec2) -> wp.vec2:
-    """Uniform on the unit disk, by the concentric map (Shirley and Chiu 1997)."""
+    """A uniform point of the unit disk, by the concentric map (Shirley and Chiu 1997)."""
     a = 2.0 * u[0] - 1.0
     b = 2.0 * u[1] - 1.0
     r = a
@@ -33,7 +33,7 @@ def square_to_disk(u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def square_to_cosine_hemisphere(u: wp.vec2, n: wp.vec3) -> wp.vec3:
-    """A unit direction around `n` with density cosθ/π per solid angle."""
+    """A unit direction around `n` with pdf cosθ/π per solid angle."""
     d = square_to_disk(u)
     z = wp.sqrt(wp.max(0.0, 1.0 - wp.dot(d, d)))
     return wp.normalize(from_local(wp.vec3(d[0], d[1], z), n))
@@ -41,7 +41,7 @@ def square_to_cosine_hemisphere(u: wp.vec2, n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def square_to_cone(u: wp.vec2, one_minus_cos: float, n: wp.vec3) -> wp.vec3:
-    """A unit direction uniform per solid angle in the cone around `n` given by 1 - cosθ_max (2: the sphere)."""
+    """A unit direction, uniform in the cone around `n` of half angle θ_max, given as 1 - cosθ_max (2: the sphere)."""
     h = u[0] * one_minus_cos
     r = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
     phi = 2.0 * wp.pi * u[1]

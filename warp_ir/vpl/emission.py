@@ -142,7 +142,7 @@ def _trace_light_path(
         vpls.bounce[i] = 0
         vpls.pdf_area[i] = scene.emitter_pdf_area[light.emitter]
         if scene.modifier_count > 0:
-            vpls.modifiers[i] = light.modifiers
+            vpls.modifiers[i] = light.modifier_row
 
     photon = emit_photon(
         scene,
@@ -159,9 +159,9 @@ def _trace_light_path(
     vpl_count = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
         hit = closest(scene, origin, direction, 3.0e38)
-        if bounce == 1 and light.modifiers >= 0:
+        if bounce == 1 and light.modifier_row >= 0:
             u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble)
-            landing = first_reflection(scene, light.modifiers, hit, direction, u_mesh)
+            landing = first_reflection(scene, light.modifier_row, hit, direction, u_mesh)
             hit = landing.hit
             flux = flux * landing.weight
         if hit.triangle < 0:

@@ -333,6 +333,6 @@ def _vpl_shaping(scene: SceneData, group: VplSets, vpl: int, position: wp.vec3) 
     cosine = -wp.dot(
         wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2]), wp.normalize(to_light)
     )
-    if cosine < modifiers.cutoff:
+    if cosine < modifiers.cutoff_cosine:
         return 0.0
     return approximate_shaping(modifiers, position, target)

@@ -72,7 +72,7 @@ def bound_of(group: VplSets, vpl: int, normal: wp.vec4) -> float:
         return UNBOUNDED
     if vpl < group.vpls.on_lights:
         return bound_for_pdf(group.bound, group.vpls.pdf_area[vpl])
-    return group.bound.least
+    return group.bound.minimum
 
 
 @wp.func
@@ -119,9 +119,9 @@ def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) 
     `density` says how much denser guided VPLs lie where they matter.
     """
     out = Bound()
-    out.least = UNBOUNDED
+    out.minimum = UNBOUNDED
     if area > wp.float64(0.0):
-        out.least = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
+        out.minimum = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
     out.per_pdf_area = float(_PI * wp.float64(on_lights) / _AREAS)
     return out
 
@@ -213,7 +213,7 @@ def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> 
             if row >= 0:
                 modifiers = scene.light_tables[0].modifiers.rows[row]
                 axis = wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2])
-                ramp = wp.vec4(modifiers.slope, modifiers.offset, modifiers.least, modifiers.cutoff)
+                ramp = wp.vec4(modifiers.ramp_slope, modifiers.ramp_offset, modifiers.ramp_min, modifiers.cutoff_cosine)
         for k in range(3):
             group.shaping[SHAPING_ROWS * i + k][lane] = axis[k]
         for k in range(4):
