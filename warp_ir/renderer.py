@@ -35,7 +35,7 @@ import warp_ir.reconstruction.sample_buffer
 import warp_ir.vpl.emission
 import warp_ir.vpl.sets
 from warp_ir.device.launcher import Cancelled, Launcher
-from warp_ir.device_scene import DeviceScene, camera_data, upload_moments, upload_scene
+from warp_ir.device_scene import DeviceScene, camera_data, upload_scene, upload_scenes
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.film.denoise import denoise_seconds
 from warp_ir.film.film import Film
@@ -101,7 +101,7 @@ class Renderer:
         if len(scene.shutter) & (len(scene.shutter) - 1):
             raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
-        uploaded = upload_moments(scenes, launcher, list({id(m.scene): m.scene for m in self._moments}.values()))
+        uploaded = upload_scenes(scenes, launcher, list({id(m.scene): m.scene for m in self._moments}.values()))
         self._moments = []
         for moment, data in zip(scenes, uploaded, strict=True):
             camera = camera_data(moment.camera, data.frame, settings)
@@ -110,7 +110,7 @@ class Renderer:
             self._moments.append(_ShutterState(data, camera, estimator, moment.camera.exposure))
         if camera.blurs and settings.filters:
             launcher.load([warp_ir.reconstruction.blur])
-        needs = {
+        needs: dict[str, Any] = {
             "columns": camera.columns,
             "rows": camera.rows,
             "mapped": any(data.data.normal_map_count > 0 for data in uploaded),

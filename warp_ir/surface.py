@@ -75,7 +75,7 @@ def spawn_ray_origin(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
     a = axes * a
     b = axes * b
     c = axes * c
-    error = (_largest(a, b, c) + scene.instances[hit.instance].size) * _EIGHT_ULP
+    error = (_largest(a, b, c) + scene.instances[hit.instance].magnitude) * _EIGHT_ULP
     return _start(a, b, c, hit.u, hit.v, direction, error) + scene.instances[hit.instance].centre
 
 
@@ -408,9 +408,9 @@ def emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
 @wp.func
 def has_glow(scene: SceneData, triangle: int) -> bool:
     """Whether the camera sees something else of a triangle than the `emission` by which it lights the scene."""
-    if scene.glow_count == 0:
+    if scene.camera_emission_count == 0:
         return False
-    return scene.surface_textures[0].glow[scene.triangle_material[triangle]][0] >= 0.0
+    return scene.surface_textures[0].camera_emission[scene.triangle_material[triangle]][0] >= 0.0
 
 
 @wp.func
@@ -419,7 +419,7 @@ def glow(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if hit.front == 0 and scene.emits_back[hit.triangle] == 0:
         return wp.vec3(0.0)
     material = scene.triangle_material[hit.triangle]
-    texture = scene.surface_textures[0].glow_texture[material]
+    texture = scene.surface_textures[0].camera_emission_texture[material]
     if texture >= 0:
         return _textured(scene.surface_textures, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
-    return scene.surface_textures[0].glow[material]
+    return scene.surface_textures[0].camera_emission[material]

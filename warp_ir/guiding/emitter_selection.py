@@ -72,4 +72,4 @@ def _rechosen(scene: DeviceScene, power: Floats, chosen: Floats, launcher: Launc
     itself = launcher.empty(1, SceneData)
     data.address = wp.uint64(itself.ptr)
     itself.assign(launcher.array([data], SceneData))
-    return replace(scene, data=data, keep=(*scene.keep, itself))
+    return replace(scene, data=data, owners=(*scene.owners, itself))

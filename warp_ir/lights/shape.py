@@ -18,7 +18,7 @@ _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 @wp.func
 def texture_of(scene: SceneData, light: int) -> int:
     """The grid that multiplies a light's radiance, or -1."""
-    if scene.textured_count == 0:
+    if scene.textured_light_count == 0:
         return -1
     return scene.light_tables[0].texture[light]
 
