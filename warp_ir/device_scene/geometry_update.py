@@ -1,7 +1,6 @@
 """The triangle tables and BVHs on the device: reused, refit or rebuilt when another scene follows."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -84,7 +83,7 @@ class DeviceGeometry:
         self._layout = layout
         self._previous_instances, self._instances = self._instances, []
 
-    def fill(self, sample: int, data: SceneData) -> tuple[Any, ...]:
+    def fill(self, sample: int, data: SceneData) -> tuple[object, ...]:
         """Sets the geometry and materials of a shutter sample in a `SceneData`; returns the owners of its ids."""
         assert self._layout is not None and self._frame is not None
         launcher, stored = self._launcher, self._layout.samples[sample]

@@ -55,7 +55,7 @@ class SceneData:
     triangle_material: wp.array[wp.int32]  # [m]
     triangle_mesh: wp.array[wp.int32]  # [m], index into Scene.meshes
     triangle_normals: wp.array[wp.int32]  # [m], first of three rows in corner_normals; -1: faceted
-    # [m], first of three rows in corner_colors; -1: the material's albedo; -2: the instance's colour
+    # [m], first of three rows in corner_colors; -1: the material's albedo; INSTANCE_COLOR: the instance's colour
     triangle_colors: wp.array[wp.int32]
     corner_normals: wp.array[wp.vec3]
     corner_colors: wp.array[wp.vec3]
@@ -69,7 +69,7 @@ class SceneData:
     texture_count: int
     normal_map_count: int  # materials with a normal map
     surface_textures: wp.array[SurfaceTextures]  # one row: calls pass a pointer instead of copying the record
-    non_opaque_count: int  # materials with opacity below 1
+    non_opaque_count: int  # materials whose opacity is below 1 anywhere
     camera_emission_count: int  # materials whose emission to the camera differs from that to surfaces
     footprint: float  # width of the surface patch over which indirect light averages textures
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too

@@ -99,8 +99,8 @@ def upload_scenes(
             raise InputError("scene: its extent is too large for a float")
         frame = snapped_frame_of_box(lower, upper)
         valid = [o for o in previous if o.is_valid and o.frame.equals(frame) and o.bounds == (*lower, *upper)]
-        found = [_find_same(scene, valid) for scene in scenes]
-        reused = [replace(same, source=scene) for same, scene in zip(found, scenes, strict=True) if same is not None]
+        matches = [_find_same(scene, valid) for scene in scenes]
+        reused = [replace(same, source=scene) for same, scene in zip(matches, scenes, strict=True) if same is not None]
         if len(reused) == len(scenes):
             return reused
         return _upload(scenes, (lower, upper), frame, launcher, previous)
