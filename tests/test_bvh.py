@@ -1,4 +1,4 @@
-"""Rays find the triangles that are there, and none slips between two of them."""
+"""BVH traversal returns the closest triangle and is watertight; refit and joined trees give the same hits."""
 
 from itertools import pairwise
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ir.bvh import Bvh, Trees, intersect
+from warp_ir.bvh import Bvh, BvhForest, intersect
 from warp_ir.procedural import cube, sphere
 
 wp.set_module_options({"enable_backward": False})
@@ -32,10 +32,10 @@ def _shoot(
 
 
 def shoot(launcher, points, triangles, origins, directions):
-    """t, triangle, uv and whether anything was hit, as NumPy arrays."""
-    trees = Trees(launcher)
+    """t, triangle, barycentrics and the any-hit triangle of each ray, as NumPy arrays."""
+    trees = BvhForest(launcher)
     trees.build([(launcher.array(points, wp.vec3), launcher.array(triangles.reshape(-1), wp.int32), 0)])
-    (bvh,) = trees.bring_together([[0]])
+    (bvh,) = trees.join([[0]])
     n = len(directions)
     out = [launcher.empty(n, d) for d in (wp.float32, wp.int32, wp.vec2, wp.int32)]
     origins = np.broadcast_to(origins, directions.shape)
@@ -44,7 +44,7 @@ def shoot(launcher, points, triangles, origins, directions):
 
 
 def brute_force(points, triangles, origins, directions):
-    """The nearest t per ray in float64 (Möller and Trumbore 1997); infinity for a miss."""
+    """The closest t per ray in float64 (Möller and Trumbore 1997); infinity for a miss."""
     a, b, c = (points[triangles[:, k]].astype(np.float64) for k in range(3))
     best = np.full(len(directions), np.inf)
     for i, (o, d) in enumerate(zip(np.broadcast_to(origins, directions.shape), directions, strict=True)):
@@ -68,8 +68,8 @@ def soup(count, seed=0):
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 64, 65, 1000])
-def test_nearest_triangle_of_a_soup(launcher, count):
-    """The nearest hit is that of testing every triangle in double precision, and the barycentrics lead to it."""
+def test_closest_triangle_of_a_soup(launcher, count):
+    """The closest hit is that of testing every triangle in double precision, and the barycentrics give its position."""
     points, triangles = soup(count)
     random = np.random.default_rng(1)
     origins = random.uniform(-0.5, 1.5, (500, 3)).astype(np.float32)
@@ -89,7 +89,7 @@ def test_nearest_triangle_of_a_soup(launcher, count):
 @pytest.mark.parametrize("target", ["vertices", "edges", "random"])
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
 def test_closed_meshes_are_watertight(launcher, shape, target, shift):
-    """No ray from inside a closed mesh escapes: not through a vertex, not through an edge, wherever the mesh lies."""
+    """No ray from inside a closed mesh escapes: not through a vertex, not through an edge, at any position in space."""
     points, triangles = sphere(level=5) if shape == "sphere" else cube()
     points = (points * 0.5 + shift).astype(np.float32)
     origin = (np.array([0.03, 0.07, -0.05]) + shift).astype(np.float32)
@@ -108,7 +108,7 @@ def test_closed_meshes_are_watertight(launcher, shape, target, shift):
 
 
 def test_axis_parallel_rays_in_the_plane_of_a_wall(launcher):
-    """Rays along an axis, with zeros in their direction and their origin on a box's plane, find what lies ahead."""
+    """Rays along an axis, with zeros in their direction and their origin on the plane of a box, hit what is ahead."""
     points, triangles = cube()
     points = np.concatenate([points, points * 0.25]).astype(np.float32)
     triangles = np.concatenate([triangles, triangles + 8])
@@ -120,7 +120,7 @@ def test_axis_parallel_rays_in_the_plane_of_a_wall(launcher):
 
 
 def test_many_coincident_triangles(launcher):
-    """A thousand copies of one triangle, which no tree can part, are hit as one."""
+    """A thousand copies of one triangle, which no tree can separate, give one hit."""
     points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
     triangles = np.tile(np.array([[0, 1, 2]], np.int32), (1000, 1))
     t, triangle, _, _ = shoot(
@@ -129,7 +129,7 @@ def test_many_coincident_triangles(launcher):
     assert t[0] == 1.0 and triangle[0] >= 0 and triangle[1] == -1
 
 
-# ---- trees that move -------------------------------------------------------------------------------------
+# ---- refit trees -------------------------------------------------------------------------------------
 
 
 def rays(count, seed):
@@ -147,26 +147,26 @@ def hits(launcher, bvh, origins, directions):
     return [x.numpy() for x in out]
 
 
-def planted(launcher, soups):
-    """Trees over soups that share the tables of a scene, these tables, and the ranges of points."""
+def build_forest(launcher, soups):
+    """One tree per soup in the tables of a common scene; returns the forest, the tables, and each soup's point rows."""
     points = launcher.array(np.concatenate([p for p, _ in soups]), wp.vec3)
     starts = np.cumsum([0] + [len(p) for p, _ in soups])
     indices = launcher.array(np.concatenate([t + s for (_, t), s in zip(soups, starts[:-1], strict=True)]), wp.int32)
     indices = indices.flatten()
-    trees, parts = Trees(launcher), []
+    trees, batches = BvhForest(launcher), []
     for k, (_, t) in enumerate(soups):
         own = launcher.array(t.reshape(-1), wp.int32)
-        parts.append((points[int(starts[k]) : int(starts[k + 1])], own, int(starts[k]) // 3))
-    trees.build(parts)
+        batches.append((points[int(starts[k]) : int(starts[k + 1])], own, int(starts[k]) // 3))
+    trees.build(batches)
     return trees, points, indices, [range(int(a), int(b)) for a, b in pairwise(starts)]
 
 
 @pytest.mark.parametrize("count", [1, 2, 9, 64])
 def test_several_trees_are_one_world(launcher, count):
-    """Soups under a tree each, brought together, are the soup of them all: the same triangles at the same t."""
+    """The joined trees of several soups give the hits of one tree over all triangles: the same triangles and t."""
     soups = [soup(17 * k + 1, seed=k) for k in range(count)]
-    trees, _, _, _ = planted(launcher, soups)
-    (bvh,) = trees.bring_together([range(count)])
+    trees, _, _, _ = build_forest(launcher, soups)
+    (bvh,) = trees.join([range(count)])
     starts = np.cumsum([0] + [len(p) for p, _ in soups])
     points = np.concatenate([p for p, _ in soups])
     triangles = np.concatenate([t + s for (_, t), s in zip(soups, starts[:-1], strict=True)])
@@ -179,11 +179,11 @@ def test_several_trees_are_one_world(launcher, count):
 
 @pytest.mark.parametrize("count", [1, 8, 9, 700])
 @pytest.mark.parametrize("way", ["shifted", "bent", "exploded"])
-def test_a_tree_that_moves_finds_what_a_new_one_finds(launcher, count, way):
-    """Hits after a move are those of a tree built there, to the bit; trees beside it are as they were."""
+def test_a_refit_tree_gives_the_hits_of_a_new_one(launcher, count, way):
+    """Hits in a refit tree are bitwise those of a new one; other trees of the forest are unchanged."""
     still, moving = soup(50, seed=4), soup(count, seed=5)
-    trees, points, indices, ranges = planted(launcher, [still, moving])
-    trees.bring_together([[0, 1]])
+    trees, points, indices, ranges = build_forest(launcher, [still, moving])
+    trees.join([[0, 1]])
     p = moving[0].astype(np.float64)
     if way == "shifted":
         p += (0.3, -0.2, 0.1)
@@ -193,9 +193,9 @@ def test_a_tree_that_moves_finds_what_a_new_one_finds(launcher, count, way):
         p = p.reshape(-1, 3, 3)[np.random.default_rng(6).permutation(count)].reshape(-1, 3) * 1.3 - 0.15
     p = p.astype(np.float32)
     wp.copy(points, launcher.array(p, wp.vec3), dest_offset=ranges[1].start)
-    good = trees.move(1, points, indices, ranges[1], 50)
+    good = trees.refit(1, points, indices, ranges[1], 50)
     assert good or way == "exploded"
-    (bvh,) = trees.bring_together([[0, 1]])
+    (bvh,) = trees.join([[0, 1]])
     origins, directions = rays(3000, 7)
     t, triangle, uv, any_hit = hits(launcher, bvh, origins, directions)
     everything = np.concatenate([still[0], p]), np.concatenate([still[1], moving[1] + 150])
@@ -205,27 +205,27 @@ def test_a_tree_that_moves_finds_what_a_new_one_finds(launcher, count, way):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_a_tree_is_bad_when_its_boxes_have_grown(launcher):
-    """A tree stays good under shifts and scales, for a ray meets as many boxes; not when triangles change places."""
+def test_refit_reports_a_tree_whose_boxes_have_grown(launcher):
+    """The cost of a tree is invariant under translation and scaling; it grows when triangles change places."""
     moving = soup(5000, seed=8)
-    trees, points, indices, ranges = planted(launcher, [moving])
-    assert trees.move(0, points, indices, ranges[0], 0)
+    trees, points, indices, ranges = build_forest(launcher, [moving])
+    assert trees.refit(0, points, indices, ranges[0], 0)
     places = moving[0].reshape(-1, 3, 3)
     for moved, good in ((places * 3.0 + 1.0, True), (places[::-1], False), (places, True)):
         points.assign(np.ascontiguousarray(moved.reshape(-1, 3)))
-        assert trees.move(0, points, indices, ranges[0], 0) is good
+        assert trees.refit(0, points, indices, ranges[0], 0) is good
 
 
-def test_trees_before_those_that_are_built_anew_stay(launcher):
-    """The last trees are replaced by others, also by fewer, while the first find what they found."""
+def test_rebuilding_the_last_trees_keeps_the_first(launcher):
+    """The last trees are replaced, by fewer here, and the first give the same hits as before."""
     first, second, third = (soup(100, seed=s) for s in (9, 10, 11))
-    trees, points, _, ranges = planted(launcher, [first, second, second])
+    trees, points, _, ranges = build_forest(launcher, [first, second, second])
     origins, directions = rays(2000, 12)
-    one = hits(launcher, trees.bring_together([[0]])[0], origins, directions)
+    one = hits(launcher, trees.join([[0]])[0], origins, directions)
     own = launcher.array(third[1].reshape(-1), wp.int32)
     wp.copy(points, launcher.array(third[0], wp.vec3), dest_offset=ranges[1].start)
-    trees.build([(points[ranges[1].start : ranges[1].stop], own, 100)], keep=1)
-    same, other, both = (hits(launcher, b, origins, directions) for b in trees.bring_together([[0], [1], [0, 1]]))
+    trees.build([(points[ranges[1].start : ranges[1].stop], own, 100)], keep_count=1)
+    same, other, both = (hits(launcher, b, origins, directions) for b in trees.join([[0], [1], [0, 1]]))
     np.testing.assert_array_equal(one[0], same[0])
     np.testing.assert_array_equal(both[0], np.minimum(same[0], other[0]))
     np.testing.assert_array_equal(other[0], shoot(launcher, *third, origins, directions)[0])

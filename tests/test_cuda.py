@@ -224,7 +224,7 @@ def blind(monkeypatch):
 def test_only_the_launcher_knows_the_device():
     """Whether a kernel's work can be looked at is asked in few places: so the CPU can stand for CUDA in these tests."""
     asking = {path.name for path in PACKAGE.rglob("*.py") if "is_cuda" in path.read_text()}
-    assert asking == {"launch.py", "profiling.py", "gather.py", "build.py", "trees.py"}
+    assert asking == {"launch.py", "profiling.py", "gather.py", "build.py", "forest.py"}
 
 
 @pytest.mark.gpu

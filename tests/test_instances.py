@@ -1,4 +1,4 @@
-"""What is stored once and seen in many places looks, shines and blocks as if it had been written out."""
+"""Instances look, reflect and occlude like the flattened scene, in which every copy is stored."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ def rotations(count, random):
 
 
 def scattered(count, *, uneven=True, seed=0):
-    """Places [count, 4, 4] in a room of size 2: turned, scaled, a third of them mirrored."""
+    """Matrices [count, 4, 4] in a room of size 2: rotated, scaled, a third of them mirrored."""
     random = np.random.default_rng(seed)
     out = np.tile(np.eye(4), (count, 1, 1))
     scale = random.uniform(0.03, 0.1, (count, 1, 3 if uneven else 1))
@@ -59,8 +59,8 @@ def crowd(count=80):
     )
 
 
-def test_copies_are_measured_as_written_out():
-    """Bounds, area and mean albedo are those of the written-out scene, to rounding."""
+def test_measures_are_those_of_the_flattened_scene():
+    """Bounds, area and mean albedo are those of the flattened scene, to rounding."""
     scene = crowd()
     flat = scene.flat()
     assert flat.instances == () and flat.triangle_count == scene.triangles_seen
@@ -71,7 +71,7 @@ def test_copies_are_measured_as_written_out():
 
 
 def test_colors_of_corners_stay_with_their_corners():
-    """Also in mirrored copies, whose corners are turned round."""
+    """Corner colours follow their corners in mirrored copies too, whose winding is reversed."""
     points, triangles = sphere(level=1)
     colors = (0.5 + 0.4 * points)[triangles].astype(np.float32)
     ball = dataclasses.replace(mesh("ball", points, triangles), colors=colors)
@@ -84,7 +84,7 @@ def test_colors_of_corners_stay_with_their_corners():
 
 @pytest.mark.parametrize("uneven", [False, True])
 def test_bounds_and_areas_of_many_copies(uneven):
-    """However the search for the outermost copies goes, it ends with the box around all of their points."""
+    """The search for the outermost copies returns the box around all of their points."""
     points, triangles = sphere(level=2)
     matrices = scattered(700, uneven=uneven, seed=3)
     matrices[5, :3, 3] = 3.0
@@ -97,7 +97,7 @@ def test_bounds_and_areas_of_many_copies(uneven):
 
 
 def test_a_picture_of_instances_is_that_of_copies(device):
-    """The camera sees the same meshes, colours, depths and normals; but for single rays at edges, by rounding."""
+    """Mesh ids, albedo, depth and normals are the same, except for single rays at edges, by rounding."""
     settings = ir.RenderSettings(width=96, height=96, iterations=2, estimator="path")
     one, other = (ir.render(scene, settings, device=device) for scene in (crowd(), crowd().flat()))
     same = one.aov("prim_id") == other.aov("prim_id")
@@ -117,7 +117,7 @@ def test_light_among_instances_is_that_among_copies(estimator, device):
 
 
 def cut_outs():
-    """Two balls with a pattern on them and half of each cut away, one of them mirrored and squeezed, under a sun."""
+    """Two textured balls with half of each cut out by opacity, one of them mirrored and squeezed, and a point light."""
     points, triangles = sphere(level=2)
     uvs = (0.5 + 0.5 * points[triangles][..., :2]).astype(np.float32)
     random = np.random.default_rng(4)
@@ -140,45 +140,52 @@ def cut_outs():
 
 
 def placed_at(*position):
-    """A matrix that only moves."""
+    """A translation."""
     matrix = np.eye(4)
     matrix[:3, 3] = position
     return matrix
 
 
 @wp.kernel
-def _look(first: int, scene: SceneData, seen: wp.array[wp.vec3], measured: wp.array[wp.vec2], lit: wp.array[wp.int32]):
-    """A ray from near the lamp into the room: a texture's mean over a patch, depth and area, and the way back."""
+def _trace(
+    first: int,
+    scene: SceneData,
+    albedos: wp.array[wp.vec3],
+    measured: wp.array[wp.vec2],
+    visibility: wp.array[wp.int32],
+):
+    """Traces a ray from near the lamp: filtered albedo, depth and area of the hit, its visibility from two points."""
     i = first + wp.tid()
     origin = wp.vec3(0.01, 0.1, 0.07)  # in the device's frame, in which the room's half size is 1/4
     d = square_to_cone(sobol.sample_2d(scene.sobol, i, 0, wp.uint32(1)), 2.0, wp.vec3(0.0, 0.0, 1.0))
     hit = closest(scene, origin, d, 3.0e38)
-    seen[i] = albedo(scene, hit, 0.005)
+    albedos[i] = albedo(scene, hit, 0.005)
     measured[i] = wp.vec2(hit.t, hit.area)
     p = hit.position
     q = wp.vec3(-0.02, -0.07, 0.07)
-    lit[i] = wp.where(visible(scene, origin, wp.vec4(p[0], p[1], p[2], 1.0)), 2, 0)
-    lit[i] += wp.where(visible(scene, q, wp.vec4(p[0], p[1], p[2], 1.0)), 1, 0)
+    visibility[i] = wp.where(visible(scene, origin, wp.vec4(p[0], p[1], p[2], 1.0)), 2, 0)
+    visibility[i] += wp.where(visible(scene, q, wp.vec4(p[0], p[1], p[2], 1.0)), 1, 0)
 
 
 def test_cut_outs_and_textures_of_instances_are_those_of_copies(launcher):
-    """The same rays pass, the same texels are seen, also by shadow rays; but for single rays at edges, by rounding."""
+    """Camera and shadow rays pass the same holes and read the same texels, except for single rays at edges."""
     n, results = 20_000, []
     for scene in (cut_outs(), cut_outs().flat()):
         arrays = [launcher.zeros(n, dtype) for dtype in (wp.vec3, wp.vec2, wp.int32)]
         uploaded = upload_scene(scene, launcher)
-        launcher.launch(_look, n, [uploaded.data, *arrays])
+        launcher.launch(_trace, n, [uploaded.data, *arrays])
         results.append([array.numpy() for array in arrays])
-    (seen, measured, lit), (flat_seen, flat_measured, flat_lit) = results
-    assert (np.isclose(seen, flat_seen, atol=1e-3).all(axis=1)).mean() > 0.999
+    (albedos, measured, visibility), (flat_albedos, flat_measured, flat_visibility) = results
+    assert (np.isclose(albedos, flat_albedos, atol=1e-3).all(axis=1)).mean() > 0.999
     assert (np.isclose(measured, flat_measured, rtol=1e-3).all(axis=1)).mean() > 0.999
-    assert (lit == flat_lit).mean() > 0.999 and (lit >= 2).mean() > 0.999 and 0.1 < (lit == 3).mean() < 0.9
-    assert 0.1 < (seen.std(axis=1) > 0.01).mean() < 0.9  # balls and room are both seen
+    assert (visibility == flat_visibility).mean() > 0.999 and (visibility >= 2).mean() > 0.999
+    assert 0.1 < (visibility == 3).mean() < 0.9
+    assert 0.1 < (albedos.std(axis=1) > 0.01).mean() < 0.9  # rays hit both the balls and the room
 
 
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device):
-    """What the camera sees, and the light that falls through the holes."""
+    """AOVs are the same, and so is the light that falls through the holes."""
     one, other = (
         render(scene, estimator, device, width=48, height=48, iterations=8) for scene in (cut_outs(), cut_outs().flat())
     )
@@ -192,7 +199,7 @@ def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device)
 
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_white_instances_vanish_in_white_light(estimator, device):
-    """Surfaces of albedo 1 under a sky of radiance 1 have radiance 1, whatever they are and wherever they stand."""
+    """Surfaces of albedo 1 under a dome of radiance 1 have radiance 1, of any shape at any position (furnace)."""
     points, triangles = sphere(level=2)
     scene = ir.Scene(
         meshes=(mesh("ball", points, triangles),),
@@ -211,7 +218,7 @@ def test_white_instances_vanish_in_white_light(estimator, device):
 
 @pytest.mark.parametrize("estimator", ["vpl", "keller", "path"])
 def test_a_furnace_of_instances(estimator, device):
-    """A closed room of tiles that all emit reaches Le / (1 - ρ): instances that emit are written out."""
+    """A closed room of emissive tiles reaches Le / (1 - ρ): instances that emit are flattened."""
     scene = dataclasses.replace(tiled_box(3, np.eye(3)), materials=(ir.Material("wall", (0.5,) * 3, (1.0,) * 3),))
     assert_mean(render(scene, estimator, device), 2.0)
 
@@ -239,7 +246,7 @@ def tiled_box(count, turn):
 
 
 @wp.kernel
-def _wander(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: wp.array[wp.int32]):
+def _reflect_around(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: wp.array[wp.int32]):
     """Six reflections inside a closed room."""
     i = first + wp.tid()
     origin = wp.vec3(0.01, 0.02, 0.03)
@@ -263,7 +270,7 @@ def _wander(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: 
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.parametrize("turned", [False, True])
 def test_walls_of_instances_let_nothing_through(launcher, count, turned, scale, shift):
-    """No ray slips between two instances whose edges meet, and each sees what it has hit, at every scale and place."""
+    """Edges between adjacent instances are watertight, and each hit is visible from its ray's origin, at any scale."""
     turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0] if turned else np.eye(3)
     scene = tiled_box(count, turn)
     matrices = scene.instances[0].matrices.copy()
@@ -273,13 +280,13 @@ def test_walls_of_instances_let_nothing_through(launcher, count, turned, scale, 
     uploaded = upload_scene(scene, launcher)
     n = 30_000
     escapes, blocked = launcher.zeros(n, wp.int32), launcher.zeros(n, wp.int32)
-    launcher.launch(_wander, n, [uploaded.data, escapes, blocked])
+    launcher.launch(_reflect_around, n, [uploaded.data, escapes, blocked])
     assert escapes.numpy().sum() == 0
     assert blocked.numpy().sum() == 0
 
 
 def test_a_small_instance_far_out_keeps_its_shape(launcher, device):
-    """Its normals are exact although the scene's coordinates have no digits left for it."""
+    """Its normals are exact although float32 world coordinates could not resolve it."""
     points, triangles = sphere(level=3)
     far = np.eye(4)
     far[:3, 3] = (1.0e5, 1.0e5, 1.0e5)
@@ -302,7 +309,7 @@ def test_a_small_instance_far_out_keeps_its_shape(launcher, device):
 
 
 def test_prototypes_of_one_geometry_share_it(launcher):
-    """Two looks of the same arrays are stored as one tree and one set of points, each with its own materials."""
+    """Two prototypes of the same arrays share one tree and one set of points, and have materials of their own."""
     points, triangles = sphere(level=2)
     red = mesh("red", points, triangles, 0)
     blue = dataclasses.replace(red, name="blue", material=np.full(len(triangles), 1, np.int32))
@@ -337,7 +344,7 @@ def test_prototypes_of_one_geometry_share_it(launcher):
     ],
 )
 def test_bad_instances_never_reach_warp(launcher, change, message):
-    """What kernels could not live with is an error that names the prototype."""
+    """Invalid instances raise an error that names the prototype."""
     scene = crowd()
     change = dict(colors=None) | change
     bad = dataclasses.replace(scene, instances=(dataclasses.replace(scene.instances[0], **change),))
@@ -346,7 +353,7 @@ def test_bad_instances_never_reach_warp(launcher, change, message):
 
 
 def test_instances_that_do_not_fit_are_refused(launcher, monkeypatch):
-    """With how many there are and what they need, before anything is allocated."""
+    """A scene too large for the memory is rejected before anything is allocated, with its size in the message."""
     monkeypatch.setattr(type(launcher), "memory", lambda self: 1000.0)
     with pytest.raises(ir.InputError, match="80 instances need about"):
         upload_scene(crowd(), launcher)
@@ -354,7 +361,7 @@ def test_instances_that_do_not_fit_are_refused(launcher, monkeypatch):
 
 @pytest.mark.slow
 def test_rays_through_instances_take_less_than_twice_those_through_copies():
-    """For the whole of an iteration, 400 instances of 2048 triangles against 819 200 triangles."""
+    """Compares whole renders: 400 instances of 2048 triangles against 819 200 triangles."""
     points, triangles = sphere(level=4)
     scene = dataclasses.replace(
         crowd(),

@@ -1,4 +1,4 @@
-"""Time: what moves is read and uploaded again, what does not is kept; an open shutter blurs what moves."""
+"""Animation and motion blur: only what moves is read and uploaded again; an open shutter blurs moving surfaces."""
 
 import json
 import math
@@ -77,8 +77,8 @@ def same(one, other):
 # ---- reading ---------------------------------------------------------------------------------------------
 
 
-def test_what_does_not_move_is_read_once():
-    """The studio and the lamps around the turntable are the same objects in every frame; what turns is not."""
+def test_static_prims_are_read_once():
+    """The studio and the lamps around the turntable are the same objects in every frame; what rotates is not."""
     reader = StageReader(TURNTABLE)
     first, second = reader.read(1.0), reader.read(2.0)
     kept = {a.name for a, b in zip(first.meshes, second.meshes, strict=True) if a is b}
@@ -88,8 +88,8 @@ def test_what_does_not_move_is_read_once():
 
 
 @pytest.mark.parametrize("time", [1.0, 2.5, 7.0])
-def test_a_frame_is_the_same_whatever_was_read_before(time):
-    """Reading in turn, or opening the stage for one moment alone: equal scenes."""
+def test_a_frame_does_not_depend_on_frames_read_before(time):
+    """Reading frames in sequence gives the same scene as opening the stage for one frame alone."""
     reader = StageReader(TURNTABLE)
     for other in (20.0, 3.0):
         reader.read(other)
@@ -122,8 +122,8 @@ VARYING = {
 
 
 @pytest.mark.parametrize("what", VARYING)
-def test_whatever_varies_is_read_again(tmp_path, what):
-    """Transforms, visibility, points, primvars, materials and instancers, of the prim and of what it depends on."""
+def test_time_varying_prims_are_read_again(tmp_path, what):
+    """Time samples of transforms, visibility, points, primvars, materials and instancers, own or of a dependency."""
     text = VARYING[what].replace("color3f inputs:emissiveColor = (1, 1, 1)\n", "")
     file = write(tmp_path, quad("Static"), text)
     reader = StageReader(file)
@@ -141,8 +141,8 @@ def test_whatever_varies_is_read_again(tmp_path, what):
     )  # fmt: skip
 
 
-def test_what_is_carried_by_velocities_moves(tmp_path):
-    """Velocities say where points are between the samples, even if there is but one sample."""
+def test_velocities_move_points(tmp_path):
+    """Velocities extrapolate points from the nearest sample, even if there is only one."""
     more = "vector3f[] velocities = [(1, 0, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0)]"
     reader = StageReader(write(tmp_path, quad("Static"), quad("Carried", more)))
     reader.read()
@@ -150,7 +150,7 @@ def test_what_is_carried_by_velocities_moves(tmp_path):
 
 
 def test_warnings_and_counts_are_those_of_every_frame(tmp_path):
-    """What is read once is told in every frame, once."""
+    """Warnings about prims that are read once appear in every frame's report, once."""
     # Besides a sound face, one without an area.
     wrong = ("faceVertexCounts = [4]", "faceVertexCounts = [4, 3]"), ("[0, 1, 2, 3]", "[0, 1, 2, 3, 1, 1, 2]")
     parts = [quad("Bad"), quad("Worse", moves("1: (0, 0, 0), 2: (1, 0, 0)"))]
@@ -165,7 +165,7 @@ def test_warnings_and_counts_are_those_of_every_frame(tmp_path):
 
 
 def test_an_updated_renderer_renders_the_same(device):
-    """Taking over from another frame changes no bit."""
+    """The picture after an update is bitwise that of a new renderer."""
     reader = StageReader(TURNTABLE)
     settings = ir.RenderSettings(width=16, iterations=2, light_paths=16)
     renderer = ir.Renderer(reader.read(1.0), settings, device=device)
@@ -178,8 +178,8 @@ def test_an_updated_renderer_renders_the_same(device):
         )
 
 
-def test_what_two_scenes_share_is_uploaded_once():
-    """A camera that moves uploads nothing; a lamp that moves leaves the surfaces and their tree where they are."""
+def test_shared_parts_are_uploaded_once():
+    """A moving camera uploads nothing; a moving lamp leaves the surfaces and their tree on the device."""
     scene = ir.load_usd(SCENES / "cornell_box.usda")
     settings = ir.RenderSettings(width=8, iterations=1, light_paths=16)
     renderer = ir.Renderer(scene, settings)
@@ -195,16 +195,16 @@ def test_what_two_scenes_share_is_uploaded_once():
     np.testing.assert_array_equal(renderer.render().radiance(), ir.render(other, settings).radiance())
 
 
-def test_what_is_kept_is_checked_against_what_is_new():
-    """A mesh that was fine with many materials is not with one."""
+def test_reused_meshes_are_checked_against_new_materials():
+    """A mesh whose material indices were valid is rejected when the new scene has fewer materials."""
     scene = ir.load_usd(SCENES / "cornell_box.usda")
     renderer = ir.Renderer(scene, ir.RenderSettings(width=4, iterations=1, light_paths=16))
     with pytest.raises(ir.InputError, match="material refers to materials outside"):
         renderer.update(replace(scene, materials=scene.materials[:1]))
 
 
-def test_the_sky_stays_where_a_lamp_or_a_mesh_moves(device):
-    """Images of lights are uploaded once; the picture is that of a new renderer, bit for bit."""
+def test_a_dome_is_not_uploaded_again_when_others_move(device):
+    """Textures of lights are uploaded once; the picture is bitwise that of a new renderer."""
     sky = ir.Light("sky", ir.LightKind.DOME, (1.0, 1.0, 1.0), texture=np.full((8, 16, 3), 0.5, np.float32))
     shaping = ir.Shaping(cone_angle=30.0)
     scene = cornell_box()
@@ -227,8 +227,8 @@ def test_the_sky_stays_where_a_lamp_or_a_mesh_moves(device):
     assert renderer.scene.distributions.upload(renderer.launcher) is not there
 
 
-def test_stats_say_what_was_kept(tmp_path):
-    """How many meshes of a frame are those of the frame before."""
+def test_stats_count_reused_meshes(tmp_path):
+    """The statistics say how many meshes of a frame are those of the frame before."""
     stats = tmp_path / "s.json"
     command = ["render", str(TURNTABLE), str(tmp_path / "#.npy"), "-w", "8", "--iterations", "1", "--frames", "1:3"]
     assert main([*command, "--light-paths", "16", "--device", "cpu", "-q", "--stats", str(stats)]) == 0
@@ -266,7 +266,7 @@ def coverage(n, shift, half):
 
 
 @pytest.mark.parametrize("what", ["transform", "points", "camera"])
-def test_coverage_of_what_moves(tmp_path, what, device):
+def test_coverage_of_a_moving_quad(tmp_path, what, device):
     """A quad that moves while the shutter is open covers a pixel for a share of the time: a trapezium.
 
     Sixteen moments stand for the time: at a place that an edge passes, the share is wrong by 1/32 at most.
@@ -300,8 +300,8 @@ def test_coverage_of_what_moves(tmp_path, what, device):
     np.testing.assert_allclose(sharp, coverage(n, 0.0, half), atol=4 * noise)
 
 
-def test_light_that_moves_lights_with_its_mean(tmp_path):
-    """A lamp whose intensity rises from 0 to 2 while the shutter is open lights like one of 1."""
+def test_a_varying_light_gives_its_mean(tmp_path):
+    """A lamp whose intensity rises from 0 to 2 while the shutter is open illuminates like one of intensity 1."""
     lamp = """def SphereLight "L" {
     float inputs:radius = 0.1
     %s
@@ -322,7 +322,7 @@ def test_light_that_moves_lights_with_its_mean(tmp_path):
 
 
 def test_no_blur_without_motion_or_shutter(tmp_path):
-    """A shutter that is not open, a stage in which nothing moves, or the stage's own wish: one moment."""
+    """A closed shutter, a static stage, or the stage's own settings give one shutter sample."""
     moving = quad("Q", moves("1: (0, 0, 0), 2: (1, 0, 0)"))
     assert ir.load_usd(write(tmp_path, CAMERA % (0, 0.5, AT_4), moving), motion_blur=False).shutter == ()
     wish = 'def RenderSettings "S" { bool disableMotionBlur = 1\n}\n'
@@ -338,8 +338,8 @@ def test_no_blur_without_motion_or_shutter(tmp_path):
     assert scene.shutter == () and any("/C" in line and "before it opens" in line for line in scene.warnings)
 
 
-def test_moments_are_as_many_as_what_moves_allows(tmp_path, monkeypatch):
-    """Triangles that move are there once for every moment: they limit their number, and those that stay do not."""
+def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):
+    """Moving triangles are stored once per shutter sample, and limit their number; static ones do not."""
     camera, moving = CAMERA % (0, 0.5, AT_4), moves("1: (0, 0, 0), 2: (1, 0, 0)")
     still = "".join(quad(f"S{k}") for k in range(20))
     few = write(tmp_path, camera, quad("Q", moving), still)
@@ -360,8 +360,8 @@ def test_blur_is_not_filtered_away():
     assert filtered == pytest.approx(plain, rel=0.01)
 
 
-def test_an_odd_number_of_moments_is_an_error():
-    """Iterations could not take them in turn."""
+def test_an_odd_number_of_shutter_samples_is_an_error():
+    """The number must be a power of two, for iterations to be stratified over the samples."""
     scene = ir.load_usd(TURNTABLE)
     with pytest.raises(ir.InputError, match="power of two"):
         ir.render(replace(scene, shutter=(scene,) * 3), ir.RenderSettings(width=4, iterations=1))

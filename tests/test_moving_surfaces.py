@@ -1,4 +1,4 @@
-"""Surfaces that move are moved where they are: what stands still is left alone, the picture is that of a new start."""
+"""Updates of moving surfaces: static geometry is untouched, and pictures are bitwise those of a new renderer."""
 
 from dataclasses import replace
 
@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from warp_ir.bvh import Trees
+from warp_ir.bvh import BvhForest
 from warp_ir.procedural import cube, mesh, sphere
 from warp_ir.scene import Instances
 
 SETTINGS = ir.RenderSettings(width=24, iterations=2, light_paths=16, estimator="path", filter=False)
 ROOM = mesh("room", *cube(2.0), 0)
-BALL = sphere(level=4)  # 2048 triangles: a tree of its own
+BALL = sphere(level=4)  # 2048 triangles: it has a tree of its own
 
 
 def ball(time, name="ball", material=1, level=4, smooth=False):
-    """It moves and bulges."""
+    """A ball whose position and shape depend on time."""
     points, triangles = sphere(level=level)
     placed = points * 0.3 * (1.0 + 0.3 * np.sin(5.0 * points[:, 1:2] + time)) + (0.2 * np.cos(time), 0.0, 0.3)
     made = mesh(name, placed, triangles, material)
@@ -38,13 +38,13 @@ MATERIALS = (
 
 
 def scene(*meshes, **more):
-    """A lit room with more in it."""
+    """A scene of meshes with one lamp."""
     camera = ir.Camera.look_at((0, 0, -0.95), (0, 0, 1), fov=80)
     return ir.Scene(meshes=meshes, materials=MATERIALS, lights=(LAMP,), camera=camera, **more)
 
 
 def places(time, count=5):
-    """Of instances."""
+    """Matrices of a row of instances."""
     out = np.tile(np.eye(4), (count, 1, 1))
     out[:, :3, :3] *= 0.3
     out[:, 0, 3] = np.linspace(-0.7, 0.7, count)
@@ -68,13 +68,13 @@ FRAMES = {
     "all of them": lambda time: scene(replace(ROOM, points=ROOM.points * (1.0 + 0.01 * time)), ball(time)),
     "small ones": lambda time: scene(ROOM, *(shrunk(m, k, time) for k, m in enumerate(SMALL))),
     "one that emits": lambda time: scene(ROOM, ball(time, material=2), STILL),
-    "one beside one that emits": lambda time: scene(ball(time), replace(STILL, material=STILL.material + 1), ROOM),
+    "one next to one that emits": lambda time: scene(ball(time), replace(STILL, material=STILL.material + 1), ROOM),
     "one that comes and goes": lambda time: scene(*([ball(time)] if int(time) % 2 else []), ROOM, STILL),
     "its triangles": lambda time: scene(ROOM, ball(time, level=3 + int(time) % 2)),
     "its looks": lambda time: scene(ROOM, ball(0.0, material=int(time) % 2)),
     "instances": lambda time: scene(ROOM, PROTOTYPE, instances=(Instances("p", (1,), places(time)),)),
     "a prototype": lambda time: scene(ROOM, ball(time), instances=(Instances("p", (1,), PLACES),)),
-    "a mesh beside instances": lambda time: scene(
+    "a mesh next to instances": lambda time: scene(
         ROOM, ball(time), PROTOTYPE, instances=(Instances("p", (2,), PLACES),)
     ),
     "a world of instances alone": lambda time: scene(
@@ -88,8 +88,8 @@ PLACES = places(0.0)
 
 
 @pytest.mark.parametrize("what", FRAMES)
-def test_what_moves_is_where_it_would_be(what, device):
-    """After each of several frames the picture is that of the frame alone, to the bit."""
+def test_an_updated_picture_is_that_of_a_new_renderer(what, device):
+    """After each of several updates the picture is bitwise that of rendering the frame alone."""
     renderer = ir.Renderer(FRAMES[what](0.0), SETTINGS, device=device)
     for time in (1.0, 2.0, 2.0, 3.0, 7.0, 0.0):
         frame = FRAMES[what](time)
@@ -101,12 +101,12 @@ def test_what_moves_is_where_it_would_be(what, device):
 
 
 @pytest.mark.parametrize("what", ["a mesh", "smooth", "all of them", "small ones", "one that emits", "a prototype"])
-def test_no_tree_is_built_for_what_only_moves(what, monkeypatch):
-    """From the second frame on it is known what moves: tables stay where they are, and trees are refit."""
+def test_moving_meshes_are_refit_not_rebuilt(what, monkeypatch):
+    """From the second frame on it is known what moves: tables stay in the same arrays, and trees are refit."""
     renderer = ir.Renderer(FRAMES[what](0.0), SETTINGS)
     renderer.update(FRAMES[what](0.1))
     before = renderer.scene.data
-    monkeypatch.setattr(Trees, "build", lambda *_: pytest.fail("a tree is built"))
+    monkeypatch.setattr(BvhForest, "build", lambda *_: pytest.fail("a tree is built"))
     for time in (0.2, 0.3):
         renderer.update(FRAMES[what](time))
         for name in ("points", "indices", "corner_normals", "triangle_material"):
@@ -114,8 +114,8 @@ def test_no_tree_is_built_for_what_only_moves(what, monkeypatch):
         assert renderer.scene.data.bvh.nodes is before.bvh.nodes
 
 
-def test_meshes_have_the_numbers_of_their_scene():
-    """A mesh without triangles moves nothing, but those after it, still or moving, have other numbers then."""
+def test_mesh_indices_follow_the_scene():
+    """Adding an empty mesh changes no geometry, but the indices of the meshes after it, static or moving."""
     empty = ir.Mesh("empty", np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
     renderer = ir.Renderer(scene(ROOM, ball(0.0)), SETTINGS)
     moved = ball(1.0)
@@ -124,8 +124,8 @@ def test_meshes_have_the_numbers_of_their_scene():
         np.testing.assert_array_equal(renderer.render().aov("prim_id"), ir.render(frame, SETTINGS).aov("prim_id"))
 
 
-def test_a_worn_tree_is_built_anew(monkeypatch):
-    """Triangles that change places wear a tree; the frame in which they do costs a new one, the next does not."""
+def test_a_degraded_tree_is_rebuilt(monkeypatch):
+    """Triangles that change places degrade a tree: it is rebuilt in that frame and refit in the next."""
     points, triangles = sphere(level=4)
     corners = (points * 0.3)[triangles]
     order = np.random.default_rng(0).permutation(len(corners))
@@ -136,9 +136,9 @@ def test_a_worn_tree_is_built_anew(monkeypatch):
         return scene(ROOM, mesh("ball", placed, indices, 1))
 
     built = []
-    build = Trees.build
+    build = BvhForest.build
     monkeypatch.setattr(
-        Trees, "build", lambda self, parts, keep=0: built.append(len(parts)) or build(self, parts, keep)
+        BvhForest, "build", lambda self, parts, keep_count=0: built.append(len(parts)) or build(self, parts, keep_count)
     )
     renderer = ir.Renderer(frame(0.0, False), SETTINGS)
     counts = []
@@ -151,12 +151,12 @@ def test_a_worn_tree_is_built_anew(monkeypatch):
     assert counts == [[2], [], [1], []]
 
 
-def test_moments_share_what_stands_still():
-    """Under an open shutter only what moves is there once for every moment; the next frame moves it."""
+def test_shutter_samples_share_static_geometry():
+    """Only moving meshes are stored once per shutter sample; the next frame overwrites them."""
 
     def frame(time):
-        moments = tuple(scene(ROOM, ball(time + 0.1 * k), STILL) for k in range(4))
-        return replace(moments[0], shutter=moments)
+        samples = tuple(scene(ROOM, ball(time + 0.1 * k), STILL) for k in range(4))
+        return replace(samples[0], shutter=samples)
 
     settings = replace(SETTINGS, iterations=4)
     renderer = ir.Renderer(frame(0.0), settings)
@@ -168,8 +168,8 @@ def test_moments_share_what_stands_still():
         assert renderer.scene.data.triangle_material.shape[0] == still + 4 * len(BALL[1])
 
 
-def test_after_a_frame_that_fails_the_next_is_right():
-    """A frame that is refused midway leaves nothing behind that could be taken for what it was."""
+def test_an_update_after_a_rejected_one_is_right():
+    """A frame that is rejected midway leaves no state that a later update could reuse by mistake."""
     good = scene(ROOM, ball(0.0), PROTOTYPE, instances=(Instances("p", (2,), PLACES),))
     flat = PLACES * np.array([1.0, 1.0, 0.0, 1.0])[:, None]
     bad = replace(good, meshes=(ROOM, ball(1.0), PROTOTYPE), instances=(Instances("p", (2,), flat),))

@@ -76,7 +76,7 @@ def camera_ray(camera: CameraData, pixel: int, u: wp.vec2, lens: wp.vec2) -> Ray
     else:
         aside = (lens[0] * camera.right + lens[1] * camera.up) * camera.lens_radius
         ray.origin = camera.origin + aside
-        ray.direction = on_film - camera.back - aside / camera.focus
+        ray.direction = on_film - camera.back - aside / camera.focus_distance
     return ray
 
 

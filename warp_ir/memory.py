@@ -1,4 +1,4 @@
-"""What a scene costs, before it is uploaded, and a picture."""
+"""Estimates of the memory that a pixel and a scene take where they are rendered, before anything is uploaded."""
 
 from collections.abc import Iterator
 
@@ -8,121 +8,169 @@ import numpy.typing as npt
 from warp_ir.scene import Instances, Light, Mesh, MeshLight, Scene
 from warp_ir.settings import RenderSettings
 
-# Bytes on the device, measured on the CPU; a GPU takes about as many.
-_BASE = 7500  # sequences, and a row of each table that is empty
-_TRIANGLE = 28  # its material, mesh, sides, and where its normals, colours, uvs and tangents are
-_TREE = 67  # of its share of the hierarchy
-_POINT = _INDICES = 12
-_CORNER = 12  # of a normal or a colour
-_UV = 8
-_EMITTER = 16
-_INSTANCE = 170
-_LIGHT = 160
-_TEXEL = 2  # of one channel: half precision
-_CHAIN = 4.0 / 3.0  # of an image with all that is made smaller of it
-_MOST_TEXELS = 2**30  # bytes to which textures are averaged down: `texture.MAX_BYTES`
-_SKY = 16  # of a texel of a light: three floats, and its probability
-_SHAPED = 8200  # directions of photons
+_FLOAT = _INT = 4
+_VEC2, _VEC3, _VEC4 = 8, 12, 16
 
-# Bytes of a pixel: twelve are a colour, a place or a direction.
-_COLOR = 12
-_FILM = 92
-_ITERATION = 68  # what the camera sees, and the light there
-_OBSERVED = 93  # by the filter, beside the film
-_LAYERS = 72  # where an iteration lay: two images and their noise
-_FILTERED = 24
-_SORTED = 18  # samples by pixels
-_DENOISER = 100  # about; what it takes for itself is not in it
+# Bytes of a pixel. `FilmData`: mean radiance, its standard deviation, and sums of the G-buffer.
+_FILM = {
+    "direct, indirect": 2 * _VEC3,
+    "deviation": _VEC3,
+    "albedo, normal, position": 3 * _VEC3,
+    "depth": _FLOAT,
+    "count, hits, rejected, mesh": 4 * _INT,
+}  # 92
+# `new_gbuffer`: what an iteration fills in. Direct light is stored in place of the geometric normal.
+_ITERATION = {
+    "position, normal or direct, shading_normal, albedo": 4 * _VEC3,
+    "indirect": _VEC3,
+    "mesh": _INT,
+    "depth": _FLOAT,
+}  # 68
+# `SampleBuffer`: the samples on the surface of each pixel, and that surface.
+_SAMPLE_BUFFER = {
+    "surface: position, normal": 2 * _VEC3,
+    "surface: footprint": _FLOAT,
+    "surface: bordering": 1,
+    "direct, indirect, other_direct, other_indirect": 4 * _VEC3,
+    "squares": _VEC2,
+    "count, other_count": 2 * _INT,
+}  # 93
+# Scratch of the filter, in the memory of the iteration: two layers of direct and indirect light with their variance.
+_FILTER_SCRATCH = {"layers": 4 * _VEC4, "noise": _VEC2}  # 72
+_RESOLVED_PICTURE = {"direct, indirect": 2 * _VEC3}  # 24
+_REPROJECTION = {"samples sorted by pixels": 4 * _INT * 9 // 8}  # 18: scratch buffers have an eighth in reserve
+_SURFACE_POINT = {"triangle, instance, weights": 3 * _INT}  # 12
+_DENOISER = 100  # approximately, for its inputs and output; what the denoiser itself allocates is not counted
 
 
 def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
-    """How much memory a pixel takes where the scene is rendered, with its picture on the host."""
-    mapped = any(material.normal_texture is not None for material in scene.materials)
-    glows = scene.glows or settings.visible_lights
-    iteration = _ITERATION + _COLOR * (glows + mapped)
-    total = _FILM + _COLOR * glows + _COLOR
-    if settings.filter and settings.estimator == "vpl":
-        iteration = max(iteration, _LAYERS)
-        total += _OBSERVED + _FILTERED
-        moments = scene.shutter if settings.motion_blur else ()
-        lens = settings.depth_of_field and scene.camera.lens_radius > 0.0
-        surfaces = {tuple(id(x) for x in (*m.meshes, *m.instances)) for m in moments}
-        total += _SORTED * (lens or len(moments) > 1) + _COLOR * (len(surfaces) > 1)
-    return total + iteration + _DENOISER * settings.denoise
+    """Bytes per pixel on the device while a scene is rendered, plus those of its picture on the host.
+
+    The sum of: the film; the buffers of one iteration, or the filter's scratch if that is larger, since they share
+    memory; the sample buffer and the resolved picture of the filter; what defocus, motion blur and the denoiser add.
+    """
+    emission = _VEC3 * (scene.glows or settings.visible_lights)
+    smooth_normal = _VEC3 * any(material.normal_texture is not None for material in scene.materials)
+    iteration = sum(_ITERATION.values()) + emission + smooth_normal
+    film = sum(_FILM.values()) + emission
+    host_picture = _VEC3
+    if not settings.filter or settings.estimator != "vpl":
+        return film + iteration + host_picture + _DENOISER * settings.denoise
+    shutter = scene.shutter if settings.motion_blur else ()
+    moves = len({_surface_ids(sample) for sample in shutter}) > 1
+    defocus = settings.depth_of_field and scene.camera.lens_radius > 0.0
+    return (
+        film
+        + max(iteration, sum(_FILTER_SCRATCH.values()))
+        + sum(_SAMPLE_BUFFER.values())
+        + sum(_RESOLVED_PICTURE.values())
+        + sum(_REPROJECTION.values()) * (defocus or len(shutter) > 1)
+        + sum(_SURFACE_POINT.values()) * moves
+        + host_picture
+        + _DENOISER * settings.denoise
+    )
+
+
+# Bytes of a scene on the device, measured on the CPU; a GPU takes about as many.
+_BASE = 7500  # the Sobol' matrices, and one row of each table that is empty
+_TRIANGLE = 28  # its material, mesh, sides, and the first rows of its normals, colours, uvs and tangents
+_TRIANGLE_INDICES = 12
+_TRIANGLE_TREE = 67  # its part of the BVH
+_TRIANGLE_EMITTER = 4  # its row in the list of emitters, if anything in the scene emits
+_POINT = _VEC3
+_CORNER = _VEC3  # a normal, a colour or a tangent
+_CORNER_UV = _VEC2
+_EMITTER = 16
+_INSTANCE = 170
+_LIGHT = 160
+_TEXEL_CHANNEL = 2  # half precision
+_MIP_CHAIN = 4.0 / 3.0  # all levels over the finest one
+_MAX_TEXTURE_BYTES = 2**30  # textures are downsampled to fit: `texture.MAX_BYTES`
+_LIGHT_TEXEL = 16  # a colour and its cumulative probability
+_SHAPING_DIRECTIONS = 8200  # the table from which photons of a shaped light take their directions
 
 
 def scene_bytes(scene: Scene) -> dict[str, int]:
-    """About how much memory a scene takes where it is rendered, to a fifth, by what takes it.
+    """Approximate bytes of a scene on the device by use, to within a fifth in all.
 
-    With the moments of an open shutter; what they share counts once. Films and VPLs are not in it.
+    All shutter samples are counted, and what they share once; films and VPLs are not counted.
+
+    Returns:
+        Bytes of "geometry", "hierarchy" (the BVHs), "instances", "textures" and "lights".
     """
     out = dict.fromkeys(("geometry", "hierarchy", "instances", "textures", "lights"), 0.0)
-    moments = {tuple(id(x) for x in (*m.meshes, *m.instances)): m for m in scene.shutter or (scene,)}
-    seen: set[object] = set()
-    triangles = sum(_add_surfaces(moment, out, seen) for moment in moments.values())
-    for moment in moments.values():
-        _add_emitters(moment, triangles, out)
+    samples = {_surface_ids(sample): sample for sample in scene.shutter or (scene,)}
+    counted: set[object] = set()
+    triangles = sum(_add_surfaces(sample, out, counted) for sample in samples.values())
+    for sample in samples.values():
+        _add_emitters(sample, triangles, out)
     textures = {texture for material in scene.materials for texture in material.textures}
-    out["textures"] = min(sum(_CHAIN * _TEXEL * texture.pixels.size for texture in textures), _MOST_TEXELS)
-    out["lights"] = _of_lights(scene)
+    texels = sum(_MIP_CHAIN * _TEXEL_CHANNEL * texture.pixels.size for texture in textures)
+    out["textures"] = min(texels, _MAX_TEXTURE_BYTES)
+    out["lights"] = _light_bytes(scene)
     out["geometry"] += _BASE
     return {name: round(size) for name, size in out.items()}
 
 
-def _add_surfaces(scene: Scene, out: dict[str, float], seen: set[object]) -> int:
-    """Counts what is not in `seen`, and puts it there; returns the triangles that this adds."""
+def _surface_ids(scene: Scene) -> tuple[int, ...]:
+    """Identifies a scene's surfaces: equal for two scenes that share all meshes and instances."""
+    return tuple(id(x) for x in (*scene.meshes, *scene.instances))
+
+
+def _add_surfaces(scene: Scene, out: dict[str, float], counted: set[object]) -> int:
+    """Adds the surfaces that are not in `counted`, and puts them there; returns the number of triangles added."""
     uv_sets = {texture.uv for material in scene.materials for texture in material.textures}
     triangles = 0
-    for mesh, copies in _stored(scene):
-        if id(mesh) in seen:
+    for mesh, copies in _stored_meshes(scene):
+        if id(mesh) in counted:
             continue
         count = len(mesh.triangles) * copies
         triangles += count
         corners = _CORNER * 3 * sum(x is not None for x in (mesh.normals, mesh.colors, mesh.tangents))
-        corners += _UV * 3 * len(uv_sets) * any(name in mesh.uvs for name in uv_sets)
-        out["geometry"] += count * (_TRIANGLE + _INDICES + corners)
+        corners += _CORNER_UV * 3 * len(uv_sets) * any(name in mesh.uvs for name in uv_sets)
+        out["geometry"] += count * (_TRIANGLE + _TRIANGLE_INDICES + corners)
         geometry = id(mesh.points), id(mesh.triangles)
-        if geometry not in seen:  # prototypes of one geometry share points and hierarchy
+        if geometry not in counted:  # prototypes of the same geometry share points and BVH
             out["geometry"] += _POINT * len(mesh.points) * copies
-            out["hierarchy"] += _TREE * count
-        seen |= {id(mesh), geometry}
+            out["hierarchy"] += _TRIANGLE_TREE * count
+        counted |= {id(mesh), geometry}
     groups = tuple(id(group) for group in scene.instances)
-    if groups not in seen:
+    if groups not in counted:
         out["instances"] += _INSTANCE * sum(len(group.matrices) for group in scene.instances)
-        seen.add(groups)
+        counted.add(groups)
     return triangles
 
 
 def _add_emitters(scene: Scene, triangles: int, out: dict[str, float]) -> None:
-    """Every moment has its own list of emitters, and the place in it of every triangle."""
-    emits = _emits(scene)
+    """Adds the emitter tables of a shutter sample: each has its own list, and a row in it for every triangle."""
+    emits = _emissive_materials(scene)
     if emits.any():
-        out["geometry"] += 4 * triangles
-        out["geometry"] += _EMITTER * sum(copies * float(emits[m.material].sum()) for m, copies in _stored(scene))
+        emitters = sum(copies * float(emits[mesh.material].sum()) for mesh, copies in _stored_meshes(scene))
+        out["geometry"] += _TRIANGLE_EMITTER * triangles + _EMITTER * emitters
 
 
-def _emits(scene: Scene) -> npt.NDArray[np.bool_]:
+def _emissive_materials(scene: Scene) -> npt.NDArray[np.bool_]:
     return np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
 
 
-def _stored(scene: Scene) -> Iterator[tuple[Mesh, int]]:
-    """Every mesh that has triangles, and how often it is written out: once, unless it is instanced and emits."""
-    emits = _emits(scene)
+def _stored_meshes(scene: Scene) -> Iterator[tuple[Mesh, int]]:
+    """Each mesh with triangles and the number of its stored copies: one, unless it is instanced and emits."""
+    emits = _emissive_materials(scene)
     group_of: dict[int, Instances] = {k: group for group in scene.instances for k in group.meshes}
     for k, mesh in enumerate(scene.meshes):
         if len(mesh.triangles):
             yield mesh, len(group_of[k].matrices) if k in group_of and emits[mesh.material].any() else 1
 
 
-def _of_lights(scene: Scene) -> float:
+def _light_bytes(scene: Scene) -> float:
     images = {id(x.texture): x.texture.size // 3 for x in scene.lights if x.texture is not None}
-    total = float(_LIGHT * len(scene.lights) + _SKY * sum(images.values()))
+    total = float(_LIGHT * len(scene.lights) + _LIGHT_TEXEL * sum(images.values()))
     links: set[frozenset[int]] = set()
-    controls: list[Light | MeshLight] = [*scene.lights, *(mesh.light for mesh in scene.meshes if mesh.light)]
-    for light in controls:
+    lights: list[Light | MeshLight] = [*scene.lights, *(mesh.light for mesh in scene.meshes if mesh.light)]
+    for light in lights:
         links |= {light.unlit, light.shadowless} - {frozenset()}
         if light.shaping is not None:
-            table = 0 if light.shaping.profile is None else light.shaping.profile.size
-            columns = 1 if light.shaping.profile is None else light.shaping.profile.shape[1]
-            total += _SHAPED * (1 + columns) / 2 + _SKY * table
-    return total + 4 * len(links) * len(scene.meshes)
+            profile = light.shaping.profile
+            texels, columns = (0, 1) if profile is None else (profile.size, profile.shape[1])
+            total += _SHAPING_DIRECTIONS * (1 + columns) / 2 + _LIGHT_TEXEL * texels
+    return total + _INT * len(links) * len(scene.meshes)

@@ -21,7 +21,7 @@ import warp as wp
 import warp_ir.bvh.build
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device.scratch import Scratch
-from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_moments
+from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_scenes
 from warp_ir.estimators import ESTIMATORS, Estimator
 from warp_ir.film import ACCUMULATE_MODULES, Film
 from warp_ir.film.denoise import denoise_seconds
@@ -177,7 +177,7 @@ class Renderer:
         if len(scene.shutter) & (len(scene.shutter) - 1):
             raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
-        uploaded = upload_moments(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
+        uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
         self._shutter = []
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)

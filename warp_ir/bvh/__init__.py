@@ -1,27 +1,28 @@
-"""Rays against triangles.
+"""Ray–triangle intersection.
 
 On CUDA this is Warp's own mesh query. On the CPU, where that query is scalar code on a binary tree, the same tree is
-laid out anew, eight children or eight triangles side by side, and a ray meets eight at a time in vector registers
-(Wald, Benthin and Boulos 2008: "Getting Rid of Packets").
+collapsed to nodes of eight children and leaves of eight triangles, which a ray tests eight at a time in vector
+registers (Wald, Benthin and Boulos 2008: "Getting Rid of Packets").
 
-What is seen in many places is stored once: a second tree, over the boxes of its instances, leads rays into the
-hierarchy of the prototype, in whose space they go on.
+Instanced prototypes are stored once: a second BVH, over the boxes of the instances, leads rays into the prototype's
+BVH, where they are traced in the prototype's space.
 """
 
 from warp_ir.bvh.build import build_instance_tree
+from warp_ir.bvh.forest import BvhForest
 from warp_ir.bvh.intersect8 import on_cuda
-from warp_ir.bvh.node_layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.node_layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel, empty_rows
 from warp_ir.bvh.traverse import intersect, intersect_instances
-from warp_ir.bvh.trees import Trees
 
 __all__ = [
     "Bvh",
+    "BvhForest",
     "Instance",
     "InstanceTree",
     "RayHit",
-    "Trees",
     "TwoLevel",
     "build_instance_tree",
+    "empty_rows",
     "intersect",
     "intersect_instances",
     "on_cuda",

@@ -1,7 +1,7 @@
-"""A ray against eight boxes or eight triangles, side by side in vector registers.
+"""Intersection of one ray with eight boxes or eight triangles at once, in vector registers.
 
-Boxes are tested conservatively (Ize 2013) and triangles by the sheared edge functions of Woop, Benthin and Wald (2013),
-evaluated so that two triangles get the same value for a common edge: no ray slips between them.
+Boxes are tested conservatively (Ize 2013), triangles by the sheared edge functions of Woop, Benthin and Wald (2013),
+evaluated so that two triangles get the same value for a common edge: the test is watertight.
 """
 
 import warp as wp
@@ -21,13 +21,13 @@ _TINY = wp.constant(1.0e-18)
 #endif
 """)
 def on_cuda() -> bool:
-    """Known at compile time: the other way costs nothing."""
+    """Whether the code is compiled for CUDA: a constant, so the branch not taken is removed."""
     ...
 
 
 @wp.func
-def reciprocal(direction: wp.vec3) -> wp.vec3:
-    """1 over each component; what is next to 0 is kept away from it."""
+def safe_reciprocal(direction: wp.vec3) -> wp.vec3:
+    """1 over each component; components smaller than 1e-18 are replaced by that with their sign."""
     inverse = wp.vec3()
     for k in range(3):
         d = direction[k]
@@ -40,9 +40,9 @@ def reciprocal(direction: wp.vec3) -> wp.vec3:
 @wp.func_native("""
     wp::vec_t<8, float> t;
     for (int i = 0; i < 8; ++i) {
-        const float ax = (near_x[i] - o[0]) * inverse[0], bx = (far_x[i] - p[0]) * inverse[0];
-        const float ay = (near_y[i] - o[1]) * inverse[1], by = (far_y[i] - p[1]) * inverse[1];
-        const float az = (near_z[i] - o[2]) * inverse[2], bz = (far_z[i] - p[2]) * inverse[2];
+        const float ax = (near_x[i] - near_origin[0]) * inverse[0], bx = (far_x[i] - far_origin[0]) * inverse[0];
+        const float ay = (near_y[i] - near_origin[1]) * inverse[1], by = (far_y[i] - far_origin[1]) * inverse[1];
+        const float az = (near_z[i] - near_origin[2]) * inverse[2], bz = (far_z[i] - far_origin[2]) * inverse[2];
         float near = ax > ay ? ax : ay;
         near = near > az ? near : az;
         near = near > 0.0f ? near : 0.0f;
@@ -52,45 +52,49 @@ def reciprocal(direction: wp.vec3) -> wp.vec3:
     }
     return t;
 """)
-def enter(
+def intersect_boxes(
     near_x: vec8,
     near_y: vec8,
     near_z: vec8,
     far_x: vec8,
     far_y: vec8,
     far_z: vec8,
-    o: wp.vec3,
-    p: wp.vec3,
+    near_origin: wp.vec3,
+    far_origin: wp.vec3,
     inverse: wp.vec3,
 ) -> vec8:
-    """Where a ray enters each of eight boxes; infinity where it misses.
+    """The distance t at which a ray enters each of eight boxes; infinity if it misses.
 
-    Both o and p are its origin, unless boxes are to be larger: then o lies as far ahead in each axis, and p behind.
+    `inverse` is 1 / direction. Both origins are the ray's, unless the boxes are padded: then `near_origin` is moved
+    forward by the padding in each axis, and `far_origin` back.
     """
     ...
 
 
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    // Without fused operations a b - c d and c d - a b are each other's negative: that is what closes the edges.
+    // Without fused multiply-add, a b - c d is exactly -(c d - a b): both triangles at an edge get the same value.
     #pragma clang fp contract(off)
 #endif
     wp::vec_t<8, float> out;
     for (int i = 0; i < 8; ++i) {
-        const float pz = az[i] - o[2], px = (ax[i] - o[0]) - s[0] * pz, py = (ay[i] - o[1]) - s[1] * pz;
-        const float qz = bz[i] - o[2], qx = (bx[i] - o[0]) - s[0] * qz, qy = (by[i] - o[1]) - s[1] * qz;
-        const float rz = cz[i] - o[2], rx = (cx[i] - o[0]) - s[0] * rz, ry = (cy[i] - o[1]) - s[1] * rz;
+        const float pz = az[i] - origin[2], px = (ax[i] - origin[0]) - shear[0] * pz,
+                    py = (ay[i] - origin[1]) - shear[1] * pz;
+        const float qz = bz[i] - origin[2], qx = (bx[i] - origin[0]) - shear[0] * qz,
+                    qy = (by[i] - origin[1]) - shear[1] * qz;
+        const float rz = cz[i] - origin[2], rx = (cx[i] - origin[0]) - shear[0] * rz,
+                    ry = (cy[i] - origin[1]) - shear[1] * rz;
         const float u = rx * qy - ry * qx, v = px * ry - py * rx, w = qx * py - qy * px;
         const float uv_min = u < v ? u : v, uv_max = u > v ? u : v;
         const float lowest = uv_min < w ? uv_min : w, highest = uv_max > w ? uv_max : w;
         const float determinant = u + v + w;
-        const float t = s[2] * (u * pz + v * qz + w * rz) / determinant;
+        const float t = shear[2] * (u * pz + v * qz + w * rz) / determinant;
         const bool inside = (lowest >= 0.0f) | (highest <= 0.0f);
         out[i] = (inside & (determinant != 0.0f) & (t >= 0.0f)) ? t : 3.0e38f;
     }
     return out;
 """)
-def meet(
+def intersect_triangles(
     ax: vec8,
     ay: vec8,
     az: vec8,
@@ -100,35 +104,41 @@ def meet(
     cx: vec8,
     cy: vec8,
     cz: vec8,
-    o: wp.vec3,
-    s: wp.vec3,
+    origin: wp.vec3,
+    shear: wp.vec3,
 ) -> vec8:
-    """Where a ray meets each of eight triangles; infinity where it misses."""
+    """The distance t at which a ray hits each of eight triangles; infinity if it misses.
+
+    Axes are permuted so that z is the direction's largest; `shear` is (x, y, 1) / z of the direction.
+    """
     ...
 
 
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    // Without fused operations a b - c d and c d - a b are each other's negative: that is what closes the edges.
+    // Without fused multiply-add, a b - c d is exactly -(c d - a b): both triangles at an edge get the same value.
     #pragma clang fp contract(off)
 #endif
     wp::vec_t<8, float> out;
     for (int i = 0; i < 8; ++i) {
-        const float pz = az[i] - o[2], px = (ax[i] - o[0]) - s[0] * pz, py = (ay[i] - o[1]) - s[1] * pz;
-        const float qz = bz[i] - o[2], qx = (bx[i] - o[0]) - s[0] * qz, qy = (by[i] - o[1]) - s[1] * qz;
-        const float rz = cz[i] - o[2], rx = (cx[i] - o[0]) - s[0] * rz, ry = (cy[i] - o[1]) - s[1] * rz;
+        const float pz = az[i] - origin[2], px = (ax[i] - origin[0]) - shear[0] * pz,
+                    py = (ay[i] - origin[1]) - shear[1] * pz;
+        const float qz = bz[i] - origin[2], qx = (bx[i] - origin[0]) - shear[0] * qz,
+                    qy = (by[i] - origin[1]) - shear[1] * qz;
+        const float rz = cz[i] - origin[2], rx = (cx[i] - origin[0]) - shear[0] * rz,
+                    ry = (cy[i] - origin[1]) - shear[1] * rz;
         const float u = rx * qy - ry * qx, v = px * ry - py * rx, w = qx * py - qy * px;
-        const float eu = fabsf(qy - ry) * e[0] + fabsf(qx - rx) * e[1];
-        const float ev = fabsf(ry - py) * e[0] + fabsf(rx - px) * e[1];
-        const float ew = fabsf(py - qy) * e[0] + fabsf(px - qx) * e[1];
+        const float eu = fabsf(qy - ry) * padding[0] + fabsf(qx - rx) * padding[1];
+        const float ev = fabsf(ry - py) * padding[0] + fabsf(rx - px) * padding[1];
+        const float ew = fabsf(py - qy) * padding[0] + fabsf(px - qx) * padding[1];
         const float determinant = u + v + w;
-        const float t = s[2] * (u * pz + v * qz + w * rz) / determinant;
+        const float t = shear[2] * (u * pz + v * qz + w * rz) / determinant;
         const bool inside = ((u >= -eu) & (v >= -ev) & (w >= -ew)) | ((u <= eu) & (v <= ev) & (w <= ew));
         out[i] = (inside & (determinant != 0.0f) & (t >= 0.0f)) ? t : 3.0e38f;
     }
     return out;
 """)
-def meet_loosely(
+def intersect_padded_triangles(
     ax: vec8,
     ay: vec8,
     az: vec8,
@@ -138,11 +148,11 @@ def meet_loosely(
     cx: vec8,
     cy: vec8,
     cz: vec8,
-    o: wp.vec3,
-    s: wp.vec3,
-    e: wp.vec2,
+    origin: wp.vec3,
+    shear: wp.vec3,
+    padding: wp.vec2,
 ) -> vec8:
-    """Likewise, with triangles that are larger by e in the two axes across the ray."""
+    """As `intersect_triangles`, with every triangle padded by `padding` in the two axes across the ray."""
     ...
 
 
@@ -151,8 +161,8 @@ def meet_loosely(
     for (int i = 0; i < 8; ++i) mask |= (t[i] < t_max ? 1 : 0) << i;
     return mask;
 """)
-def below(t: vec8, t_max: float) -> int:
-    """A bit for each lane that is less than t_max."""
+def lanes_below(t: vec8, t_max: float) -> int:
+    """A bit mask of the lanes that are less than t_max."""
     ...
 
 
@@ -164,5 +174,5 @@ def below(t: vec8, t_max: float) -> int:
 #endif
 """)
 def first_lane(mask: int) -> int:
-    """The lowest bit that is set; `mask` is not 0."""
+    """The index of the lowest set bit; `mask` is not 0."""
     ...

@@ -1,12 +1,11 @@
-"""Trees whose triangles have moved: the same nodes, with the boxes that there are now.
+"""Refits a BVH after its points have moved: the topology stays, the boxes follow the triangles.
 
-A tree that is refit finds what a new one finds, but the more its triangles have changed places, the more boxes a ray
-meets. How many is measured by the surface area of all boxes over that of the whole (MacDonald and Booth 1990).
+Rays find the same hits as in a new tree, but test more boxes the more the triangles have changed places. The expected
+number is the surface area of all boxes over that of the root's (MacDonald and Booth 1990).
 """
 
-from typing import Any
-
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ir.bvh.node_layout import INFINITY, Bvh
@@ -17,37 +16,37 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 @wp.kernel
-def _move_blocks(
+def _refit_blocks(
     first: int,
     first_block: int,
-    shift: int,
+    row_offset: int,
     points: wp.array[wp.vec3],
     indices: wp.array[wp.int32],
     bvh: Bvh,
 ) -> None:
-    """Fetches the corners of a block's triangles anew; `shift` leads from their numbers to their rows."""
+    """Reads the corners of a block's triangles again; a triangle's number plus `row_offset` is its row in `indices`."""
     block = first_block + first + wp.tid()
     for lane in range(8):
         triangle = bvh.triangles[block][lane]
         if triangle >= 0:
             for corner in range(3):
-                p = points[indices[3 * (triangle + shift) + corner]]
+                p = points[indices[3 * (triangle + row_offset) + corner]]
                 for axis in range(3):
                     bvh.blocks[9 * block + 3 * corner + axis][lane] = p[axis]
 
 
 @wp.kernel
-def _fit_leaves(first: int, first_node: int, bvh: Bvh) -> None:
-    """The boxes of a node's children that are leaves."""
+def _refit_leaf_boxes(first: int, first_node: int, bvh: Bvh) -> None:
+    """Recomputes the boxes of those children of a node that are leaves."""
     node = first_node + first + wp.tid()
     for k in range(8):
-        # An empty lane's box is inside out.
+        # The box of an unused lane is inverted: its lower corner is above the upper one.
         if bvh.children[node][k] < 0 and bvh.nodes[6 * node][k] <= bvh.nodes[6 * node + 3][k]:
             lower = wp.vec3(INFINITY)
             upper = wp.vec3(-INFINITY)
             block = ~bvh.children[node][k]
-            more = int(1)
-            while more == 1:
+            continues = int(1)
+            while continues == 1:
                 for lane in range(8):
                     if bvh.triangles[block][lane] >= 0:
                         for corner in range(3):
@@ -55,7 +54,7 @@ def _fit_leaves(first: int, first_node: int, bvh: Bvh) -> None:
                             p = wp.vec3(bvh.blocks[base][lane], bvh.blocks[base + 1][lane], bvh.blocks[base + 2][lane])
                             lower = wp.min(lower, p)
                             upper = wp.max(upper, p)
-                more = bvh.chained[block]
+                continues = bvh.continues[block]
                 block += 1
             for axis in range(3):
                 bvh.nodes[6 * node + axis][k] = lower[axis]
@@ -63,8 +62,8 @@ def _fit_leaves(first: int, first_node: int, bvh: Bvh) -> None:
 
 
 @wp.kernel
-def _fit_nodes(first: int, first_node: int, count: int, bvh: Bvh) -> None:
-    """The boxes of all other children: a tree's nodes come after those above them, so backwards in one go."""
+def _refit_inner_boxes(first: int, first_node: int, count: int, bvh: Bvh) -> None:
+    """Recomputes the boxes of inner children from the last node to the first: a node is stored before its children."""
     for i in range(count):
         node = first_node + count - 1 - i
         for k in range(8):
@@ -76,8 +75,8 @@ def _fit_nodes(first: int, first_node: int, count: int, bvh: Bvh) -> None:
 
 
 @wp.kernel
-def _measure_nodes(first: int, first_node: int, bvh: Bvh, areas: wp.array[wp.float32]) -> None:
-    """Half the surface of the boxes of each node's children."""
+def _measure_wide_nodes(first: int, first_node: int, bvh: Bvh, areas: wp.array[wp.float32]) -> None:
+    """Half the surface area of the boxes of each node's children, summed."""
     i = first + wp.tid()
     area = float(0.0)
     for k in range(8):
@@ -91,54 +90,61 @@ def _measure_nodes(first: int, first_node: int, bvh: Bvh, areas: wp.array[wp.flo
 
 
 @wp.kernel
-def _measure_warp_tree(first: int, tree: wp.uint64, areas: wp.array[wp.float32]) -> None:
-    """Half the surface of each box of Warp's tree."""
+def _measure_warp_nodes(first: int, tree: wp.uint64, areas: wp.array[wp.float32]) -> None:
+    """Half the surface area of each box of Warp's tree."""
     i = first + wp.tid()
     d = box_corner(tree, i, 1) - box_corner(tree, i, 0)
     areas[i] = d[0] * d[1] + d[1] * d[2] + d[2] * d[0]
 
 
 def refit_tree(
-    bvh: Any, nodes: range, blocks: range, points: Any, indices: Any, shift: int, launcher: Launcher
+    bvh: Bvh,
+    nodes: range,
+    blocks: range,
+    points: wp.array[wp.vec3],
+    indices: wp.array[wp.int32],
+    row_offset: int,
+    launcher: Launcher,
 ) -> None:
-    """Moves a wide tree's triangles and boxes to where its points are now.
+    """Updates a wide tree's triangles and boxes to the current points.
 
     Args:
-        bvh: The `Bvh` in whose tables it is.
-        nodes: Which of them, the root first.
-        blocks: Which of its blocks.
+        bvh: The `Bvh` whose tables hold the tree.
+        nodes: The tree's nodes, the root first.
+        blocks: The tree's blocks.
         points: vec3, the scene's.
         indices: int32, the scene's.
-        shift: From the numbers of the tree's triangles to their rows in `indices`.
-        launcher: Runs it.
+        row_offset: From the numbers of the tree's triangles to their rows in `indices`.
+        launcher: Runs the kernels.
     """
-    launcher.launch(_move_blocks, len(blocks), [blocks.start, shift, points, indices, bvh])
-    launcher.launch(_fit_leaves, len(nodes), [nodes.start, bvh])
-    launcher.launch(_fit_nodes, 1, [nodes.start, len(nodes), bvh])
+    launcher.launch(_refit_blocks, len(blocks), [blocks.start, row_offset, points, indices, bvh])
+    launcher.launch(_refit_leaf_boxes, len(nodes), [nodes.start, bvh])
+    launcher.launch(_refit_inner_boxes, 1, [nodes.start, len(nodes), bvh])
 
 
-def wide_cost(bvh: Any, nodes: range, launcher: Launcher) -> float:
-    """How many boxes of a wide tree a ray that meets the whole meets on average, but for a factor."""
+def wide_tree_cost(bvh: Bvh, nodes: range, launcher: Launcher) -> float:
+    """Expected number of boxes of a wide tree that a ray through the root's box hits, up to a constant factor."""
     areas = launcher.empty(len(nodes), wp.float32)
-    launcher.launch(_measure_nodes, len(nodes), [nodes.start, bvh, areas])
-    lower, upper = box_of(bvh, nodes.start)
-    return _cost(areas.numpy(), upper - lower)
+    launcher.launch(_measure_wide_nodes, len(nodes), [nodes.start, bvh, areas])
+    lower, upper = node_box(bvh, nodes.start)
+    return _relative_area(areas.numpy(), upper - lower)
 
 
-def warp_cost(tree: int, root: int, count: int, launcher: Launcher) -> float:
-    """Likewise of Warp's own tree of so many nodes."""
+def warp_tree_cost(tree: int, root: int, count: int, launcher: Launcher) -> float:
+    """Expected number of boxes of Warp's tree of `count` nodes that a ray through the root's box hits."""
     areas = launcher.empty(count, wp.float32)
-    launcher.launch(_measure_warp_tree, count, [tree, areas])
+    launcher.launch(_measure_warp_nodes, count, [tree, areas])
     measured = areas.numpy()
     return float(measured.sum(dtype=np.float64) / max(float(measured[root]), 1.0e-30))
 
 
-def box_of(bvh: Any, node: int) -> tuple[Any, Any]:
-    """Lower and upper corner [3] of the box around a wide tree's node."""
+def node_box(bvh: Bvh, node: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Lower and upper corner [3] of the box around a node of a wide tree."""
     rows = bvh.nodes[6 * node : 6 * node + 6].numpy()
     return rows[:3].min(axis=1), rows[3:].max(axis=1)
 
 
-def _cost(areas: Any, size: Any) -> float:
+def _relative_area(areas: npt.NDArray[np.float32], size: npt.NDArray[np.float32]) -> float:
+    """The sum of half areas over that of a box of a size [3]."""
     whole = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
     return float(areas.sum(dtype=np.float64) / max(float(whole), 1.0e-30))

@@ -1,10 +1,9 @@
-"""A small tree over the boxes of whole trees, so that each of them can change by itself.
+"""A small BVH over the boxes of whole trees: it joins them, and each can be refit or rebuilt by itself.
 
-Two levels of nodes are room for 64 trees; the walk's stack counts on it.
+It has at most two levels of nodes, for up to 64 trees; the size of the traversal stack relies on that.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,39 +11,41 @@ import numpy.typing as npt
 _WIDTH = 8
 
 
-def build_top(
+def build_top_level(
     lower: npt.NDArray[np.floating], upper: npt.NDArray[np.floating], roots: Sequence[int], first_node: int
-) -> tuple[Any, Any]:
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """Nodes float32 [6 k, 8] and children int32 [k, 8] of a wide tree, numbered from `first_node` on, the root first.
 
     Args:
-        lower: Lower corners [n, 3] of the boxes, 2 to 64.
-        upper: Upper corners.
-        roots: What becomes the child where a box is: n nodes.
-        first_node: Number of the first node.
+        lower: Lower corners [n, 3] of the boxes, 2 <= n <= 64.
+        upper: Upper corners [n, 3].
+        roots: The root node of each box's tree, [n].
+        first_node: Number of the first new node.
     """
     assert len(lower) <= _WIDTH**2
     nodes: list[npt.NDArray[np.float32]] = []
     children: list[npt.NDArray[np.int32]] = []
 
-    def gather(members: npt.NDArray[np.int64]) -> int:
+    def add_node(members: npt.NDArray[np.int64]) -> int:
         number = len(nodes)
         box = np.full((6, _WIDTH), 3.0e38, np.float32)
         box[3:] = -3.0e38
         child = np.full(_WIDTH, -1, np.int32)
         nodes.append(box)
         children.append(child)
-        for lane, group in enumerate(_parted(lower, upper, members)):
+        for lane, group in enumerate(_split(lower, upper, members)):
             box[:3, lane], box[3:, lane] = lower[group].min(axis=0), upper[group].max(axis=0)
-            child[lane] = roots[group[0]] if len(group) == 1 else gather(group)
+            child[lane] = roots[group[0]] if len(group) == 1 else add_node(group)
         return number + first_node
 
-    gather(np.arange(len(lower)))
+    add_node(np.arange(len(lower)))
     return np.concatenate(nodes), np.stack(children)
 
 
-def _parted(lower: Any, upper: Any, members: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
-    """At most eight groups: the largest is halved along its longest side until there are so many."""
+def _split(
+    lower: npt.NDArray[np.floating], upper: npt.NDArray[np.floating], members: npt.NDArray[np.int64]
+) -> list[npt.NDArray[np.int64]]:
+    """At most eight groups of boxes: the largest group is halved along its longest axis until there are eight."""
     groups = [members]
     while len(groups) < min(_WIDTH, len(members)):
         k = int(np.argmax([len(group) for group in groups]))

@@ -1,12 +1,12 @@
-"""The scene on a device: `upload_scene` puts it there, kernels see it as `SceneData`.
+"""The scene on a device: `upload_scene` copies it there, kernels read it as `SceneData`.
 
-`upload.py` is the whole on one page; `records.py` says what is there.
+`upload.py` is the upload on one page; `scene_data.py` defines the records.
 """
 
 from warp_ir.device_scene.camera_data import CameraData, camera_data
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.scene_data import INSTANCE_COLOR, TRIANGLE_EMITTER, SceneData, SurfaceTextures
-from warp_ir.device_scene.upload import DeviceScene, upload_moments, upload_scene
+from warp_ir.device_scene.upload import DeviceScene, upload_scene, upload_scenes
 
 __all__ = [
     "INSTANCE_COLOR",
@@ -17,6 +17,6 @@ __all__ = [
     "SceneData",
     "SurfaceTextures",
     "camera_data",
-    "upload_moments",
     "upload_scene",
+    "upload_scenes",
 ]

@@ -1,6 +1,4 @@
-"""The camera as the kernels see it."""
-
-from typing import Any
+"""The record in which kernels read the camera."""
 
 import numpy as np
 import warp as wp
@@ -13,43 +11,43 @@ wp.set_module_options({"enable_backward": False})
 
 
 Planes = wp.types.matrix(shape=(MAX_CLIPPING_PLANES, 4), dtype=wp.float32)
-"""A clipping plane a row: n and d of n·(p - origin) + d >= 0."""
+"""One clipping plane per row, n and d: a point p is visible if n·(p - origin) + d >= 0."""
 
 
 @wp.struct
 class CameraData:
-    """A camera in the scene's device frame, and the image it fills."""
+    """A camera in the scene's device frame, and the pixels of its film."""
 
-    columns: int  # of the film: the whole image, or the data window in it
+    columns: int  # of the film: the whole image, or the data window within it
     rows: int
-    first_column: int  # of the film in the image
+    first_column: int  # of the film within the image
     first_row: int
     image_columns: int
     image_rows: int
     visible_lights: int  # 1: analytic lights are visible
     origin: wp.vec3
-    right: wp.vec3
+    right: wp.vec3  # the camera's +X, +Y and +Z axis; its viewing direction is -Z
     up: wp.vec3
     back: wp.vec3
-    left: float
+    left: float  # the window in the plane z = -1 (perspective), or in device units (orthographic)
     bottom: float
     width: float
     height: float
-    near: float
+    near: float  # clipping range of the depth along -Z
     far: float
     plane_count: int  # clipping planes
     planes: Planes
     orthographic: int
     lens_radius: float  # 0: a pinhole
-    focus: float  # depth of the plane that is sharp
-    blurs: int  # 1: the rays of a pixel differ in more than where they cross it
+    focus_distance: float  # depth of the plane in focus
+    blurs: int  # 1: the picture has defocus or motion blur
 
 
-def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> Any:
-    """The `CameraData` of a camera fitted to the image that the settings describe; their height must be set.
+def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) -> CameraData:
+    """The `CameraData` of a camera fitted to the image that the settings describe; `settings.height` must be set.
 
     Raises:
-        InputError: The window is empty, or something is not finite.
+        InputError: The window is empty, or a value is not finite or out of range.
     """
     assert settings.height is not None
     if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.window).all()):
@@ -80,12 +78,13 @@ def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) ->
     out.far = min(camera.clipping[1] * frame.scale, 3.0e38)
     out.plane_count, out.planes = len(camera.clipping_planes), _planes(camera, frame)
     out.orthographic = int(not perspective)
-    out.lens_radius, out.focus = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
+    out.lens_radius, out.focus_distance = lens * frame.scale, min(camera.focus_distance * frame.scale, 3.0e38)
     out.blurs = int(lens > 0.0)
     return out
 
 
-def _planes(camera: Camera, frame: DeviceFrame) -> Any:
+def _planes(camera: Camera, frame: DeviceFrame) -> Planes:
+    """The clipping planes in the device frame, with unit normals."""
     table = np.zeros((MAX_CLIPPING_PLANES, 4))
     if len(camera.clipping_planes) > len(table):
         raise InputError(f"camera {camera.name!r}: has more than {len(table)} clipping planes")

@@ -1,23 +1,22 @@
-"""The tables of triangles, and what rays find them by: kept, moved or made anew as scenes follow each other."""
+"""The triangle tables and BVHs on the device: reused, refit or rebuilt when another scene follows."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.bvh import Trees, TwoLevel
+from warp_ir.bvh import Bvh, BvhForest, TwoLevel
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.corner_attributes import corner_tables
 from warp_ir.device_scene.frame import DeviceFrame
-from warp_ir.device_scene.geometry_storage import Layout, Part
-from warp_ir.device_scene.growing_table import Table
+from warp_ir.device_scene.geometry_storage import GeometryLayout, MeshBatch
+from warp_ir.device_scene.growing_table import GrowingTable
 from warp_ir.device_scene.instance_tables import InstanceTables, upload_instances
 from warp_ir.device_scene.material_tables import LARGEST_UV, upload_materials
-from warp_ir.device_scene.scene_data import INSTANCE_COLOR, SurfaceTextures
-from warp_ir.scene import Scene, Texture
-from warp_ir.texture import upload_textures
+from warp_ir.device_scene.scene_data import INSTANCE_COLOR, SceneData, SurfaceTextures
+from warp_ir.scene import Floats, Mesh, Scene, Texture
+from warp_ir.texture import TextureTable, upload_textures
 
 _TYPES = {
     "points": wp.vec3,
@@ -34,227 +33,226 @@ _TYPES = {
     "triangle_tangents": wp.int32,
     "corner_tangents": wp.vec3,
 }
-_CORNERS = ("corner_normals", "corner_colors", "corner_uvs", "corner_tangents")
-_PATTERNS = ("triangle_uvs", "corner_uvs", "triangle_tangents", "corner_tangents")
-"""Those that are for textures."""
+_CORNER_TABLES = ("corner_normals", "corner_colors", "corner_uvs", "corner_tangents")
+_TEXTURE_TABLES = ("triangle_uvs", "corner_uvs", "triangle_tangents", "corner_tangents")
+"""The tables that belong to `SurfaceTextures`; the others belong to `SceneData`."""
 
 
 class DeviceGeometry:
-    """The surfaces of a scene's moments on a device; owns what the records refer to by id."""
+    """The surfaces of a scene's shutter samples on a device; owns what the records refer to by id."""
 
     def __init__(self, launcher: Launcher) -> None:
-        """Empty: `take` comes first."""
+        """Starts empty; `update` has to be called before `fill`."""
         self._launcher = launcher
-        self._trees = Trees(launcher)
-        self._tables: dict[str, Table] = {}
-        self._layout: Layout | None = None
-        self._moving: set[str] = set()
+        self._forest = BvhForest(launcher)
+        self._tables: dict[str, GrowingTable] = {}
+        self._layout: GeometryLayout | None = None
+        self._moving: set[str] = set()  # names of meshes that have moved
         self._frame: DeviceFrame | None = None
         self._uv_sets: list[str] = []
-        self._textures: tuple[list[Texture], Any] | None = None
-        self._instances: list[InstanceTables] = []
-        self._former: list[InstanceTables] = []
-        self._bvhs: list[Any] = []
-        self.changes = 0
-        """How often `take` has changed what was there."""
+        self._textures: tuple[list[Texture], TextureTable] | None = None
+        self._instances: list[InstanceTables] = []  # of the samples filled since the last update
+        self._previous_instances: list[InstanceTables] = []
+        self._bvhs: list[Bvh] = []  # one per shutter sample
+        self.version = 0
+        """Number of updates that have changed what was stored."""
 
-    def take(self, scenes: Sequence[tuple[Scene, list[int]]], frame: DeviceFrame) -> None:
-        """Brings the moments of a scene onto the device, and keeps of what is there all that is the same.
+    def update(self, scenes: Sequence[tuple[Scene, list[int]]], frame: DeviceFrame) -> None:
+        """Uploads the geometry of a scene's shutter samples, as far as it differs from what is stored.
 
         Args:
-            scenes: As `storage.storage_order` gives them.
-            frame: Of the device.
+            scenes: What `storage_order` returns for each shutter sample.
+            frame: The device's frame.
         """
         uv_sets = list(dict.fromkeys(t.uv for scene, _ in scenes for m in scene.materials for t in m.textures))
-        layout, before = Layout(scenes, frame, self._moving), self._layout
-        kept = self._frame is not None and frame.equals(self._frame) and uv_sets == self._uv_sets
-        if not (kept and before is not None and _same_parts(before.head, layout.head)):
-            if before is not None:
-                there = {id(mesh) for scene, _ in scenes for mesh in scene.meshes}
-                self._moving |= {m.name for part in before.head for m in part.meshes if id(m) not in there}
-                layout = Layout(scenes, frame, self._moving)
+        layout, previous = GeometryLayout(scenes, frame, self._moving), self._layout
+        comparable = self._frame is not None and frame.equals(self._frame) and uv_sets == self._uv_sets
+        if not (comparable and previous is not None and _same_batches(previous.static_batches, layout.static_batches)):
+            if previous is not None:
+                present = {id(mesh) for scene, _ in scenes for mesh in scene.meshes}
+                self._moving |= {m.name for b in previous.static_batches for m in b.meshes if id(m) not in present}
+                layout = GeometryLayout(scenes, frame, self._moving)
             self._frame, self._uv_sets = frame, uv_sets
-            self._build(layout)
-        elif not _same_parts(before.tail, layout.tail) or len(before.moments) != len(layout.moments):
-            self._change(before, layout)
-        elif self._numbers(before) != self._numbers(layout):
-            self._number(layout)
+            self._upload_all(layout)
+        elif not _same_batches(previous.moving_batches, layout.moving_batches) or (
+            len(previous.samples) != len(layout.samples)
+        ):
+            self._upload_moving(previous, layout)
+        elif _mesh_indices(previous) != _mesh_indices(layout):
+            self._upload_mesh_indices(layout)
         self._layout = layout
-        self._former, self._instances = self._instances, []
+        self._previous_instances, self._instances = self._instances, []
 
-    def fill(self, moment: int, data: Any) -> Any:
-        """Sets what a `SceneData` says of surfaces; returns the owner of what it refers to by id."""
-        assert self._layout is not None
-        launcher, here = self._launcher, self._layout.moments[moment]
+    def fill(self, sample: int, data: SceneData) -> tuple[object, ...]:
+        """Sets the geometry and materials of a shutter sample in a `SceneData`; returns the owners of its ids."""
+        assert self._layout is not None and self._frame is not None
+        launcher, stored = self._launcher, self._layout.samples[sample]
         data.triangle_count = self._layout.triangle_count
         for name in _TYPES:
-            if name not in _PATTERNS:
+            if name not in _TEXTURE_TABLES:
                 setattr(data, name, self._tables[name].array)
-        surface_textures = upload_materials(here.scene.materials, self._texture_table, data, launcher)
-        for name in _PATTERNS:
+        surface_textures = upload_materials(stored.scene.materials, self._texture_table, data, launcher)
+        for name in _TEXTURE_TABLES:
             setattr(surface_textures, name, self._tables[name].array)
         data.surface_textures = launcher.array([surface_textures], SurfaceTextures)
-        data.bvh = self._bvhs[moment]
-        roots = [self._trees.root(part.tree) for part in here.prototypes]
-        assert self._frame is not None
-        instances = upload_instances(here, self._frame, roots, [*self._instances, *self._former], launcher)
+        data.bvh = self._bvhs[sample]
+        roots = [self._forest.root(batch.tree) for batch in stored.prototypes]
+        reusable = [*self._instances, *self._previous_instances]
+        instances = upload_instances(stored, self._frame, roots, reusable, launcher)
         if instances not in self._instances:
             self._instances.append(instances)
         data.instance_count, data.instances = instances.count, instances.tree.instances
         data.instance_axes, data.instance_colors = instances.axes, instances.colors
-        both = TwoLevel()
-        both.bvh, both.tree = data.bvh, instances.tree
-        data.two_level = launcher.array([both], TwoLevel)
-        return self, surface_textures, instances, both
+        two_level = TwoLevel()
+        two_level.bvh, two_level.tree = data.bvh, instances.tree
+        data.two_level = launcher.array([two_level], TwoLevel)
+        return self, surface_textures, instances, two_level
 
-    def rows(self, moment: int) -> list[int]:
-        """Of each mesh of the moment's arranged scene the row of its first triangle; -1: it has none."""
+    def first_triangles(self, sample: int) -> list[int]:
+        """The row of the first triangle of each mesh of a shutter sample, in storage order; -1: the mesh has none."""
         assert self._layout is not None
-        return self._layout.moments[moment].rows()
+        return self._layout.samples[sample].first_triangles()
 
-    def _build(self, layout: Layout) -> None:
-        """Everything anew."""
-        self.changes += 1
-        head = self._host(layout.head, dict.fromkeys(_CORNERS, 0))
-        tail = self._host(layout.tail, {name: len(head[name]) for name in _CORNERS})
-        self._tables = {name: Table(head[name], tail[name], dtype, self._launcher) for name, dtype in _TYPES.items()}
-        self._grow(layout, [*layout.head, *layout.tail], 0)
+    def _upload_all(self, layout: GeometryLayout) -> None:
+        """Uploads all tables and builds all trees."""
+        self.version += 1
+        static = self._host_tables(layout.static_batches, dict.fromkeys(_CORNER_TABLES, 0))
+        moving = self._host_tables(layout.moving_batches, {name: len(static[name]) for name in _CORNER_TABLES})
+        self._tables = {
+            name: GrowingTable(static[name], moving[name], dtype, self._launcher) for name, dtype in _TYPES.items()
+        }
+        self._build_trees(layout, [*layout.static_batches, *layout.moving_batches], 0)
 
-    def _change(self, before: Layout, layout: Layout) -> None:
-        """What moves anew, by moving it if it is still the same triangles."""
-        self.changes += 1
-        tail = self._host(layout.tail, {name: self._tables[name].head for name in _CORNERS})
+    def _upload_moving(self, previous: GeometryLayout, layout: GeometryLayout) -> None:
+        """Replaces the moving rows; refits their trees if the triangles are the same, and rebuilds them otherwise."""
+        self.version += 1
+        first = {name: self._tables[name].static_count for name in _CORNER_TABLES}
+        moving = self._host_tables(layout.moving_batches, first)
         for name, table in self._tables.items():
-            table.change(tail[name])
-        if self._numbers(before) != self._numbers(layout):
-            self._number(layout)
-        old, keep = before.tail, layout.head_end[2]
-        if len(old) != len(layout.tail) or not all(
-            new.is_in_place_of(part) for new, part in zip(layout.tail, old, strict=True)
-        ):
-            self._grow(layout, layout.tail, keep)
+            table.replace_moving(moving[name])
+        if _mesh_indices(previous) != _mesh_indices(layout):
+            self._upload_mesh_indices(layout)
+        old, new = previous.moving_batches, layout.moving_batches
+        if len(old) != len(new) or not all(b.can_refit(a) for b, a in zip(new, old, strict=True)):
+            self._build_trees(layout, new, layout.static_tree_count)
             return
-        worn = [
-            part.tree
-            for part, last in zip(layout.tail, old, strict=True)
-            if not (part.is_twin or _same_meshes(part, last) or self._move(part))
+        degraded = [
+            b.tree
+            for b, a in zip(new, old, strict=True)
+            if not (b.shares_geometry or same_objects(b.meshes, a.meshes) or self._refit(b))
         ]
-        if worn:
-            self._grow(layout, [part for part in layout.tail if part.tree >= min(worn)], min(worn))
+        if degraded:
+            self._build_trees(layout, [b for b in new if b.tree >= min(degraded)], min(degraded))
         else:
-            self._bring_together(layout)
+            self._join_trees(layout)
 
-    def _move(self, part: Part) -> bool:
+    def _refit(self, batch: MeshBatch) -> bool:
+        """Refits a batch's tree; returns whether its cost is still acceptable."""
         points, indices = self._tables["points"].array, self._tables["indices"].array
-        return self._trees.move(part.tree, points, indices, part.points, part.triangles.start)
+        return self._forest.refit(batch.tree, points, indices, batch.point_rows, batch.triangle_rows.start)
 
-    def _grow(self, layout: Layout, parts: Sequence[Part], keep: int) -> None:
-        """Builds the trees of parts; the first `keep` trees stay."""
+    def _build_trees(self, layout: GeometryLayout, batches: Sequence[MeshBatch], keep_count: int) -> None:
+        """Builds the trees of batches; the first `keep_count` trees stay."""
         launcher = self._launcher
         points, indices = self._tables["points"].array, self._tables["indices"].array
-        wanted = []
-        for part in parts:
-            if not part.is_twin:
-                own = indices[3 * part.triangles.start : 3 * part.triangles.stop]
-                if part.points.start:
-                    own = launcher.array(own.numpy() - part.points.start, wp.int32)
-                shift = part.triangles.start if part.half is None else 0
-                wanted.append((points[part.points.start : part.points.stop], own, shift))
-        if not all(moment.world for moment in layout.moments):
-            # An empty mesh crashes Warp; three coincident points are never hit.
-            wanted.append((launcher.zeros(3, wp.vec3), launcher.array([0, 1, 2], wp.int32), 0))
-        self._trees.build(wanted, keep)
-        self._bring_together(layout)
+        inputs = []
+        for batch in batches:
+            if not batch.shares_geometry:
+                own = indices[3 * batch.triangle_rows.start : 3 * batch.triangle_rows.stop]
+                if batch.point_rows.start:
+                    own = launcher.array(own.numpy() - batch.point_rows.start, wp.int32)
+                triangle_offset = batch.triangle_rows.start if batch.half_extent is None else 0
+                inputs.append((points[batch.point_rows.start : batch.point_rows.stop], own, triangle_offset))
+        if not all(sample.world for sample in layout.samples):
+            # An empty mesh crashes Warp; a degenerate triangle, three equal points, is never hit.
+            inputs.append((launcher.zeros(3, wp.vec3), launcher.array([0, 1, 2], wp.int32), 0))
+        self._forest.build(inputs, keep_count)
+        self._join_trees(layout)
 
-    def _bring_together(self, layout: Layout) -> None:
-        nothing = [layout.tree_count]
-        worlds = [[part.tree for part in moment.world] or nothing for moment in layout.moments]
-        self._bvhs = self._trees.bring_together(worlds)
+    def _join_trees(self, layout: GeometryLayout) -> None:
+        degenerate = [layout.tree_count]
+        worlds = [[batch.tree for batch in sample.world] or degenerate for sample in layout.samples]
+        self._bvhs = self._forest.join(worlds)
 
-    def _numbers(self, layout: Layout) -> list[tuple[int, ...]]:
-        return [part.numbers for part in (*layout.head, *layout.tail)]
+    def _upload_mesh_indices(self, layout: GeometryLayout) -> None:
+        """Uploads the index of every triangle's mesh: meshes before it in the user's scene were added or removed."""
+        triangle_mesh = _triangle_mesh([*layout.static_batches, *layout.moving_batches])
+        if len(triangle_mesh):
+            wp.copy(self._tables["triangle_mesh"].array, self._launcher.array(triangle_mesh, wp.int32))
 
-    def _number(self, layout: Layout) -> None:
-        """The numbers of all meshes anew: others before them have come or gone."""
-        numbers = _numbered([*layout.head, *layout.tail])
-        if len(numbers):
-            wp.copy(self._tables["triangle_mesh"].array, self._launcher.array(numbers, wp.int32))
-
-    def _host(self, parts: Sequence[Part], first: dict[str, int]) -> dict[str, Any]:
-        """Rows of all tables for parts; those of corners begin at `first`."""
-        meshes = [mesh for part in parts for mesh in part.meshes]
+    def _host_tables(self, batches: Sequence[MeshBatch], first: dict[str, int]) -> dict[str, npt.NDArray[np.generic]]:
+        """The rows of all tables for batches; `first` are the rows at which their corner tables begin."""
+        meshes = [mesh for batch in batches for mesh in batch.meshes]
         counts = [len(mesh.triangles) for mesh in meshes]
-        points: list[Any] = [np.zeros((0, 3), np.float32)]
-        indices: list[Any] = [np.zeros(0, np.int32)]
-        for part in parts:
-            row = part.points.start
-            for mesh in part.meshes:
+        points: list[npt.NDArray[np.float32]] = [np.zeros((0, 3), np.float32)]
+        indices: list[npt.NDArray[np.int32]] = [np.zeros(0, np.int32)]
+        for batch in batches:
+            row = batch.point_rows.start
+            for mesh in batch.meshes:
                 indices.append((mesh.triangles + np.int32(row)).reshape(-1).astype(np.int32, copy=False))
-                if not part.is_twin:
-                    placed = part.frame.to_device(mesh.points)
-                    # A stray point that no triangle uses may be anything: keep it from the bounds and the compiler.
-                    placed[~np.isfinite(placed).all(axis=1)] = 0.0
-                    points.append(placed)
+                if not batch.shares_geometry:
+                    on_device = batch.frame.to_device(mesh.points)
+                    # Points that no triangle uses are not checked and may be infinite; the bounds need finite ones.
+                    on_device[~np.isfinite(on_device).all(axis=1)] = 0.0
+                    points.append(on_device)
                 row += len(mesh.points)
-        out: dict[str, Any] = {"points": np.concatenate(points), "indices": np.concatenate(indices)}
-        out["triangle_material"] = _per_triangle([mesh.material for mesh in meshes])
-        out["triangle_mesh"] = _numbered(parts)
+        out: dict[str, npt.NDArray[np.generic]] = {"points": np.concatenate(points), "indices": np.concatenate(indices)}
+        materials = [np.zeros(0, np.int32), *(mesh.material for mesh in meshes)]
+        out["triangle_material"] = np.concatenate(materials).astype(np.int32, copy=False)
+        out["triangle_mesh"] = _triangle_mesh(batches)
         out["emits_back"] = np.repeat(np.array([mesh.double_sided for mesh in meshes], np.int32), counts)
         for name in ("normals", "colors", "tangents"):
             values = [getattr(mesh, name) for mesh in meshes]
             rows, table = corner_tables(values, counts, first[f"corner_{name}"])
             out[f"triangle_{name}"], out[f"corner_{name}"] = rows, table
-        bare = [
-            mesh.bare if part.colored and mesh.bare is not None else np.zeros(len(mesh.triangles), bool)
-            for part in parts
-            for mesh in part.meshes
+        by_instance = [
+            mesh.bare if batch.has_instance_colors and mesh.bare is not None else np.zeros(len(mesh.triangles), bool)
+            for batch in batches
+            for mesh in batch.meshes
         ]
-        if bare:
-            out["triangle_colors"][np.concatenate(bare)] = INSTANCE_COLOR
+        if by_instance:
+            out["triangle_colors"][np.concatenate(by_instance)] = INSTANCE_COLOR
         sets = max(len(self._uv_sets), 1)
-        uvs = [self._uvs(mesh) for mesh in meshes]
+        uvs = [self._stacked_uvs(mesh) for mesh in meshes]
         out["triangle_uvs"], out["corner_uvs"] = corner_tables(uvs, counts, first["corner_uvs"], 2, 3 * sets)
         return out
 
-    def _uvs(self, mesh: Any) -> Any:
-        """Those of its texture coordinates that textures use, [m, sets, 3, 2], or None."""
+    def _stacked_uvs(self, mesh: Mesh) -> Floats | None:
+        """The texture coordinates of a mesh for all uv sets that textures use, [m, sets, 3, 2]; None: it has none."""
         sets = [mesh.uvs.get(name) for name in self._uv_sets]
         if all(s is None for s in sets):
             return None
         zero = np.zeros((len(mesh.triangles), 3, 2), np.float32)
-        chosen = np.stack([zero if s is None else s for s in sets], axis=1)
-        return np.asarray(chosen, np.float32).clip(-LARGEST_UV, LARGEST_UV)
+        stacked = np.stack([zero if s is None else s for s in sets], axis=1)
+        return np.asarray(stacked, np.float32).clip(-LARGEST_UV, LARGEST_UV)
 
-    def _texture_table(self, textures: list[Texture]) -> Any:
-        """The textures on the device."""
+    def _texture_table(self, textures: list[Texture]) -> TextureTable:
+        """The textures on the device; uploaded again only if they are other objects."""
         if self._textures is None or not same_objects(self._textures[0], textures):
             self._textures = textures, upload_textures(textures, self._uv_sets, self._launcher)
         return self._textures[1]
 
 
-def same_objects(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    """Whether two sequences hold the same objects."""
+def same_objects(one: Sequence[object], other: Sequence[object]) -> bool:
+    """Whether two sequences hold the same objects, by identity."""
     return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
 
 
-def _same_meshes(one: Part, other: Part) -> bool:
-    return same_objects(one.meshes, other.meshes)
-
-
-def _same_parts(one: Sequence[Part], other: Sequence[Part]) -> bool:
-    """Whether the same meshes are in the same rows, and look the same."""
+def _same_batches(one: Sequence[MeshBatch], other: Sequence[MeshBatch]) -> bool:
+    """Whether the same meshes are in the same rows, with instance colours alike."""
     return len(one) == len(other) and all(
-        _same_meshes(a, b) and (a.triangles, a.tree, a.colored) == (b.triangles, b.tree, b.colored)
+        same_objects(a.meshes, b.meshes)
+        and (a.triangle_rows, a.tree, a.has_instance_colors) == (b.triangle_rows, b.tree, b.has_instance_colors)
         for a, b in zip(one, other, strict=True)
     )
 
 
-def _per_triangle(values: Sequence[Any]) -> npt.NDArray[np.int32]:
-    return np.concatenate([np.zeros(0, np.int32), *values]).astype(np.int32, copy=False)
+def _mesh_indices(layout: GeometryLayout) -> list[tuple[int, ...]]:
+    return [batch.mesh_indices for batch in (*layout.static_batches, *layout.moving_batches)]
 
 
-def _numbered(parts: Sequence[Part]) -> npt.NDArray[np.int32]:
-    """Of each triangle its mesh's number in the scene as the user knows it."""
-    numbers = [number for part in parts for number in part.numbers]
-    counts = [len(mesh.triangles) for part in parts for mesh in part.meshes]
-    return np.repeat(np.array(numbers, np.int32), counts)
+def _triangle_mesh(batches: Sequence[MeshBatch]) -> npt.NDArray[np.int32]:
+    """The index in the user's scene of each triangle's mesh."""
+    indices = [index for batch in batches for index in batch.mesh_indices]
+    counts = [len(mesh.triangles) for batch in batches for mesh in batch.meshes]
+    return np.repeat(np.array(indices, np.int32), counts)

@@ -1,30 +1,35 @@
-"""A table on the device whose first rows stay while those after them change."""
+"""A table on the device whose first rows are static while the rows after them are replaced."""
 
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
 
 
-class Table:
-    """An array; never empty, so that kernels never get a null pointer."""
+class GrowingTable:
+    """A device array of static rows followed by moving ones; never empty, so that kernels never get a null pointer."""
 
-    def __init__(self, head: Any, tail: Any, dtype: Any, launcher: Launcher) -> None:
-        """Uploads host arrays, `head` before `tail`."""
-        self._launcher, self._dtype, self.head = launcher, dtype, len(head)
-        both = np.concatenate([head, tail]) if len(tail) else head
-        self.array = launcher.array(both, dtype) if len(both) else launcher.zeros(1, dtype)
+    def __init__(
+        self, static: npt.NDArray[np.generic], moving: npt.NDArray[np.generic], dtype: Any, launcher: Launcher
+    ) -> None:
+        """Uploads both parts as an array of a Warp type."""
+        self._launcher, self._dtype = launcher, dtype
+        self.static_count = len(static)
+        """Number of static rows."""
+        rows = np.concatenate([static, moving]) if len(moving) else static
+        self.array: wp.array[Any] = launcher.array(rows, dtype) if len(rows) else launcher.zeros(1, dtype)
 
-    def change(self, tail: Any) -> None:
-        """Uploads other rows in place of those after the head; in the same array if there are as many."""
-        if not len(tail):
+    def replace_moving(self, moving: npt.NDArray[np.generic]) -> None:
+        """Replaces the moving rows; in the same array if their number stays."""
+        if not len(moving):
             return
-        rows = self._launcher.array(tail, self._dtype)
-        if self.array.shape[0] != self.head + len(tail):
-            array = self._launcher.empty(self.head + len(tail), self._dtype)
-            if self.head:
-                wp.copy(array, self.array, count=self.head)
+        rows = self._launcher.array(moving, self._dtype)
+        if self.array.shape[0] != self.static_count + len(moving):
+            array = self._launcher.empty(self.static_count + len(moving), self._dtype)
+            if self.static_count:
+                wp.copy(array, self.array, count=self.static_count)
             self.array = array
-        wp.copy(self.array, rows, dest_offset=self.head)
+        wp.copy(self.array, rows, dest_offset=self.static_count)

@@ -1,28 +1,31 @@
 """The tables of materials and textures."""
 
 from collections.abc import Callable
-from typing import Any
 
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene.scene_data import SurfaceTextures
+from warp_ir.device_scene.scene_data import SceneData, SurfaceTextures
 from warp_ir.scene import Material, Texture
+from warp_ir.texture import TextureTable
 
 LARGEST_UV = 1.0e6
-"""Texture coordinates beyond are clamped: floats have no digits left for them."""
+"""Texture coordinates are clamped to this magnitude: at a larger one float32 has no fractional digits to speak of."""
 
 
 def upload_materials(
-    materials: tuple[Material, ...], texture_table: Callable[[list[Texture]], Any], data: Any, launcher: Launcher
-) -> Any:
-    """Fills the tables of materials; returns the `SurfaceTextures`, in which the texture coordinates are still missing.
+    materials: tuple[Material, ...],
+    texture_table: Callable[[list[Texture]], TextureTable],
+    data: SceneData,
+    launcher: Launcher,
+) -> SurfaceTextures:
+    """Fills the tables of materials; returns the `SurfaceTextures`, whose texture coordinates the caller has to set.
 
     Args:
-        materials: Of the scene.
-        texture_table: Puts textures on the device.
-        data: The `SceneData`.
-        launcher: Whose device it is for.
+        materials: The scene's materials.
+        texture_table: Uploads textures.
+        data: The `SceneData` to fill.
+        launcher: Launcher of the device.
     """
     materials = materials or (Material(),)
     textures = list(dict.fromkeys(texture for material in materials for texture in material.textures))
@@ -39,9 +42,9 @@ def upload_materials(
     data.normal_map_count = sum(m.normal_texture is not None for m in materials)
     surface_textures = SurfaceTextures()
     surface_textures.textures = texture_table(textures)
-    unseen = (-1.0, -1.0, -1.0)
-    surface_textures.glow = launcher.array([unseen if m.glow is None else m.glow for m in materials], wp.vec3)
-    surface_textures.glow_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
-    data.glow_count = sum(m.glow is not None for m in materials)
+    unset = (-1.0, -1.0, -1.0)
+    surface_textures.camera_emission = launcher.array([unset if m.glow is None else m.glow for m in materials], wp.vec3)
+    surface_textures.camera_emission_texture = launcher.array([row[m.glow_texture] for m in materials], wp.int32)
+    data.camera_emission_count = sum(m.glow is not None for m in materials)
     surface_textures.normal_texture = launcher.array([row[m.normal_texture] for m in materials], wp.int32)
     return surface_textures

@@ -1,4 +1,4 @@
-"""The records that kernels take: the scene as they see it."""
+"""The records in which kernels read the scene."""
 
 import warp as wp
 
@@ -11,99 +11,96 @@ from warp_ir.texture import TextureTable
 wp.set_module_options({"enable_backward": False})
 
 INSTANCE_COLOR = -2
-"""In `SceneData.triangle_colors`: the triangle has the colour of its instance."""
+"""Value of `SceneData.triangle_colors`: the triangle has the colour of its instance."""
 TRIANGLE_EMITTER = len(LightKind)
-"""Kind of an emitter that is a triangle of an emissive mesh; the kinds below it are `LightKind`'s."""
+"""`SceneData.emitter_kind` of a triangle of an emissive mesh; the values below it are those of `LightKind`."""
 
 
 @wp.struct
 class SurfaceTextures:
-    """The textures, and where they lie; and what the camera sees of some materials."""
+    """Textures and texture coordinates of surfaces, normal maps, and emission that only the camera receives."""
 
     textures: TextureTable
-    triangle_uvs: wp.array[wp.int32]  # [m], first of its rows in corner_uvs, three for every set; -1: none
+    triangle_uvs: wp.array[wp.int32]  # [m], first of the triangle's rows in corner_uvs, three per uv set; -1: none
     corner_uvs: wp.array[wp.vec2]
-    triangle_tangents: wp.array[wp.int32]  # [m], first of its three rows in corner_tangents; -1: its own
-    corner_tangents: wp.array[wp.vec3]  # directions in which u grows
-    glow: wp.array[wp.vec3]  # [materials], what the camera sees in place of the emission; negative: nothing else
-    glow_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
+    triangle_tangents: wp.array[wp.int32]  # [m], first of three rows in corner_tangents; -1: computed from the uvs
+    corner_tangents: wp.array[wp.vec3]  # directions of increasing u
+    camera_emission: wp.array[wp.vec3]  # [materials], radiance to the camera in place of the emission; negative: unset
+    camera_emission_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
     normal_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
 
 
 @wp.struct
 class LightTables:
-    """Textures and controls of lights."""
+    """Textures and modifiers of lights."""
 
-    texture: wp.array[wp.int32]  # [lights], the grid that multiplies the radiance, or -1
+    texture: wp.array[wp.int32]  # [lights], index of the distribution that multiplies the radiance; -1: none
     distributions: Distribution2DTables
     modifiers: LightModifierTables
 
 
 @wp.struct
 class SceneData:
-    """Geometry, materials and emitters. Empty tables hold one unused row; the counts tell."""
+    """Geometry, materials and emitters. Tables without entries hold one unused row; the counts are 0 then."""
 
-    bvh: Bvh  # every surface; never empty
+    bvh: Bvh  # over all triangles; never empty
     instance_count: int
-    two_level: wp.array[TwoLevel]  # `bvh` and the tree over the instances: one row
+    two_level: wp.array[TwoLevel]  # one row: `bvh` and the BVH over the instances
     instances: wp.array[Instance]
-    instance_axes: wp.array[wp.mat33]  # device_from_local, around Instance.centre
-    instance_colors: wp.array[wp.vec3]  # one row if none has any
+    instance_axes: wp.array[wp.mat33]  # linear part of device_from_local; Instance.centre is the translation
+    instance_colors: wp.array[wp.vec3]  # [instances]; one row if none has a colour
     triangle_count: int
-    points: wp.array[wp.vec3]  # in the device frame; those of a prototype in its own
+    points: wp.array[wp.vec3]  # in the device frame; those of a prototype in the prototype's frame
     indices: wp.array[wp.int32]  # [3 m]
     triangle_material: wp.array[wp.int32]  # [m]
     triangle_mesh: wp.array[wp.int32]  # [m], index into Scene.meshes
-    triangle_normals: wp.array[wp.int32]  # [m], first of its three rows in corner_normals; -1: faceted
-    triangle_colors: wp.array[
-        wp.int32
-    ]  # [m], first of its three rows in corner_colors; -1: the material's; -2: the instance's
+    triangle_normals: wp.array[wp.int32]  # [m], first of three rows in corner_normals; -1: faceted
+    # [m], first of three rows in corner_colors; -1: the material's albedo; INSTANCE_COLOR: the instance's colour
+    triangle_colors: wp.array[wp.int32]
     corner_normals: wp.array[wp.vec3]
     corner_colors: wp.array[wp.vec3]
     albedo: wp.array[wp.vec3]  # [materials]
     emission: wp.array[wp.vec3]  # [materials] radiance
     opacity: wp.array[wp.float32]  # [materials]
-    cutoff: wp.array[wp.float32]  # [materials], absent below it; 0: present at random
+    cutoff: wp.array[wp.float32]  # [materials], opacity below which a surface is absent; 0: stochastic alpha test
     albedo_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
-    emission_texture: wp.array[wp.int32]
-    opacity_texture: wp.array[wp.int32]
+    emission_texture: wp.array[wp.int32]  # as albedo_texture
+    opacity_texture: wp.array[wp.int32]  # as albedo_texture
     texture_count: int
-    normal_map_count: int  # materials with one
-    surface_textures: wp.array[SurfaceTextures]  # one: a pointer is passed where a table would be copied
+    normal_map_count: int  # materials with a normal map
+    surface_textures: wp.array[SurfaceTextures]  # one row: calls pass a pointer instead of copying the record
     non_opaque_count: int  # materials whose opacity is below 1 anywhere
-    glow_count: int  # materials of which the camera sees something else than their emission
-    footprint: float  # width of the patch that a reflection of light stands for
+    camera_emission_count: int  # materials whose emission to the camera differs from that to surfaces
+    footprint: float  # width of the surface patch over which indirect light averages textures
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
-    centre: wp.vec3  # of a sphere that holds all surfaces, next to the origin
+    centre: wp.vec3  # of the bounding sphere of all surfaces, near the origin
     radius: float
 
     emitter_count: int
-    emitter_cdf: wp.array[wp.float32]  # [emitters + 1], by power, from 0 to 1
+    emitter_cdf: wp.array[wp.float32]  # [emitters + 1], from 0 to 1; selection probabilities are proportional to power
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
-    emitter_pdf_area: wp.array[wp.float32]  # [emitters], probability over area; 0 for what has none
-    emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or triangle
-    triangle_emitter: wp.array[wp.int32]  # [m], its emitter or -1; one row if no material emits
+    emitter_pdf_area: wp.array[wp.float32]  # [emitters], selection probability / area; 0 for emitters without area
+    emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or of the triangle tables
+    triangle_emitter: wp.array[wp.int32]  # [m], row of the emitter tables or -1; one row if no material emits
 
     light_count: int  # analytic lights
     light_kind: wp.array[wp.int32]
     light_origin: wp.array[wp.vec3]
-    light_axes: wp.array[wp.mat33]  # columns: what the unit shape's x, y, z become; rotation for DISTANT
+    light_axes: wp.array[wp.mat33]  # columns: images of the unit shape's x, y, z axes; a rotation for DISTANT
     light_inverse: wp.array[wp.mat33]
     light_radiance: wp.array[wp.vec3]
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
-    light_emitter: wp.array[wp.int32]  # its row in the emitter tables, or -1
-    textured_count: int  # lights with a texture
-    modifier_count: int  # lights, and surfaces, with a control
-    shaped_count: int  # of them with a shaping
-    only_sampled_count: int  # lights with an area that rays are not to find
-    light_tables: wp.array[
-        LightTables
-    ]  # one row: what few scenes have must not be copied with the others' at every call
+    light_emitter: wp.array[wp.int32]  # [lights], row of the emitter tables or -1
+    textured_light_count: int  # lights with a texture
+    modifier_count: int  # lights and emissive surfaces with modifiers
+    shaped_count: int  # of these, those with a shaping
+    only_sampled_count: int  # lights with an area that rays do not intersect: light sampling alone accounts for them
+    light_tables: wp.array[LightTables]  # one row: calls pass a pointer instead of copying the record
     shape_count: int  # lights with an area: RECT to CYLINDER
-    shape_bvh: wp.uint64  # boxes around them
+    shape_bvh: wp.uint64  # id of the `wp.Bvh` over their boxes
     shape_light: wp.array[wp.int32]  # [shapes], row of the light tables
 
-    sobol: wp.array[wp.uint32]
-    # Of a copy of this record on the device. Functions that are called, and not copied into their callers, take this: a
-    # record of this size passed by value would be written out at every call, and kept from the registers of the caller.
+    sobol: wp.array[wp.uint32]  # generator matrices of the low-discrepancy sequence
+    # Address of a copy of this record on the device, for functions that are not inlined: passed by value, a record of
+    # this size would be written to memory at every call and could not stay in the caller's registers.
     address: wp.uint64

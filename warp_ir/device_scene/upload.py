@@ -1,67 +1,66 @@
-"""The one function that puts a scene on a device, and takes what is there already."""
+"""Uploads a scene to a device, and reuses what an earlier upload left there."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene.emitter_table import upload_emitters
-from warp_ir.device_scene.frame import DeviceFrame, steady_frame_of_box
+from warp_ir.device_scene.frame import DeviceFrame, snapped_frame_of_box
 from warp_ir.device_scene.geometry_storage import storage_order
 from warp_ir.device_scene.geometry_update import DeviceGeometry, same_objects
-from warp_ir.device_scene.light_tables import upload_lights
+from warp_ir.device_scene.light_tables import UploadedLights, upload_lights
 from warp_ir.device_scene.scene_data import SceneData
 from warp_ir.device_scene.validate import check_scene
 from warp_ir.sampling import sobol
 from warp_ir.sampling.distribution2d import Distribution2DList
-from warp_ir.scene import InputError, Scene, materials_of
+from warp_ir.scene import Floats, InputError, Scene, materials_of
 
-_PATCHES = 2**14
-"""Where light is reflected, textures are means over as many patches of the scene's surface: VPLs are no denser."""
+_TEXTURE_PATCHES = 2**14
+"""Indirect light averages textures over this fraction of the scene's surface area: VPLs are not denser than that."""
 
 
 @dataclass(frozen=True)
 class DeviceScene:
     """An uploaded scene; owns what `data` refers to by id."""
 
-    data: Any
-    """The `SceneData` for kernels."""
+    data: SceneData
+    """The record for kernels."""
     frame: DeviceFrame
     extent: float
     """Diagonal of the bounding box in the device's frame."""
     area: float
     """Area of all surfaces in the device's frame."""
     mean_albedo: float
-    """Mean reflectivity ρ̄ of the surfaces."""
+    """Mean albedo ρ̄ of the surfaces."""
     max_albedo: float
     """Largest albedo of any surface and channel."""
     emits: bool
     """Whether anything in the scene emits."""
-    keep: tuple[Any, ...]
-    """The owners of the surfaces and of the lights: a struct holds only their ids, and a freed id crashes."""
+    owners: tuple[object, ...]
+    """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
     source: Scene
-    """What was uploaded."""
-    surfaces: DeviceGeometry
-    """Shared with other moments; and handed on to what is uploaded next."""
-    changes: int
-    """Of the surfaces, when this was uploaded."""
+    """The scene that was uploaded."""
+    geometry: DeviceGeometry
+    """Shared by all shutter samples, and passed on to the next upload."""
+    geometry_version: int
+    """`geometry.version` at the time of the upload."""
     stored: Scene
-    """`source` as it is arranged in the tables ..."""
-    rows: list[int]
-    """... and the row of the first triangle of each of its meshes; -1: it has none."""
+    """`source` in storage order."""
+    first_triangles: list[int]
+    """Row of the first triangle of each mesh of `stored`; -1: it has none."""
     distributions: Distribution2DList
-    """The images and the shaping of its lights."""
+    """The textures and the shaping of its lights."""
     bounds: tuple[float, ...]
-    """Lower and upper corner of all moments together, in the world."""
+    """Lower and upper corner of all shutter samples together, in world space."""
 
     @property
     def is_valid(self) -> bool:
-        """Whether its surfaces are still there."""
-        return self.changes == self.surfaces.changes
+        """Whether its geometry is still on the device: no later upload has replaced it."""
+        return self.geometry_version == self.geometry.version
 
 
 def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
@@ -70,19 +69,24 @@ def upload_scene(scene: Scene, launcher: Launcher) -> DeviceScene:
     Raises:
         InputError: An array has the wrong shape or a bad value; the message names the mesh or light.
     """
-    return upload_moments((scene,), launcher)[0]
+    return upload_scenes((scene,), launcher)[0]
 
 
-def upload_moments(
+def upload_scenes(
     scenes: Sequence[Scene], launcher: Launcher, previous: Sequence[DeviceScene] = ()
 ) -> list[DeviceScene]:
-    """Checks scenes and copies them to the launcher's device, into one frame.
+    """Checks the shutter samples of a scene and copies them to the launcher's device, into one frame.
 
-    Meshes, textures and trees that are the same objects in several of them are there once, and lights as well. The
-    surfaces of `previous` ones are taken over and changed where they differ, so those must not be used afterwards.
+    Meshes, textures, lights and trees that are the same objects in several samples are stored once. The geometry of
+    `previous` is reused and modified where it differs, so those scenes must not be used afterwards.
+
+    Args:
+        scenes: The shutter samples, at least one.
+        launcher: Launcher of the device.
+        previous: The result of an earlier call with this launcher.
 
     Raises:
-        InputError: As for `upload_scene`.
+        InputError: An array has the wrong shape or a bad value; the message names the mesh or light.
     """
     with launcher.phase("upload"):
         checked = {id(x) for other in previous for x in (*other.source.meshes, *other.source.materials)}
@@ -91,58 +95,46 @@ def upload_moments(
             checked |= {id(x) for x in (*scene.meshes, *scene.materials)}
         bounds = [scene.bounds() for scene in scenes]
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
-        extent = float(np.linalg.norm(upper - lower))
-        if not np.isfinite(extent):
+        if not np.isfinite(np.linalg.norm(upper - lower)):
             raise InputError("scene: its extent is too large for a float")
-        frame = steady_frame_of_box(lower, upper)
+        frame = snapped_frame_of_box(lower, upper)
         valid = [o for o in previous if o.is_valid and o.frame.equals(frame) and o.bounds == (*lower, *upper)]
-        there = [_find(scene, valid) for scene in scenes]
-        if all(there):
-            return [replace(found, source=scene) for found, scene in zip(there, scenes, strict=True) if found]
+        matches = [_find_same(scene, valid) for scene in scenes]
+        reused = [replace(same, source=scene) for same, scene in zip(matches, scenes, strict=True) if same is not None]
+        if len(reused) == len(scenes):
+            return reused
         return _upload(scenes, (lower, upper), frame, launcher, previous)
 
 
 def _upload(
     scenes: Sequence[Scene],
-    bounds: tuple[Any, Any],
+    bounds: tuple[Floats, Floats],
     frame: DeviceFrame,
     launcher: Launcher,
     previous: Sequence[DeviceScene],
 ) -> list[DeviceScene]:
-    """Scenes that are not all there; `previous` ones may have parts of them."""
+    """Uploads shutter samples that differ from `previous` ones, of which it reuses what is the same."""
     lower, upper = bounds
     extent = float(np.linalg.norm(upper - lower))
     stored = [storage_order(scene) for scene in scenes]
-    lit: list[tuple[Any, Any, Distribution2DList, Any]] = []
-    distributions = [other.distributions for other in previous]
-    for k, scene in enumerate(scenes):
-        like = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
-        if like is not None:
-            lit.append((copy_record(lit[like][0]), *lit[like][1:]))
-            continue
-        data = SceneData()
-        data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
-        data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
-        # Links name meshes by their numbers in the scene, not by where they are stored.
-        lit.append((data, *upload_lights(scene, frame, data, launcher, distributions)))
-        distributions.append(lit[-1][2])
-    surfaces = previous[0].surfaces if previous else DeviceGeometry(launcher)
-    surfaces.take(stored, frame)
+    lights = _upload_lights(scenes, bounds, frame, launcher, [other.distributions for other in previous])
+    geometry = previous[0].geometry if previous else DeviceGeometry(launcher)
+    geometry.update(stored, frame)
     done: list[DeviceScene] = []
-    for k, (scene, (data, shapes, own, gain)) in enumerate(zip(scenes, lit, strict=True)):
-        same = _find(scene, done)
+    for k, (scene, (data, uploaded)) in enumerate(zip(scenes, lights, strict=True)):
+        same = _find_same(scene, done)
         if same is not None:
             done.append(replace(same, source=scene))
             continue
         area = scene.area() * frame.scale**2
-        data.footprint = math.sqrt(area / _PATCHES)
-        owners = surfaces.fill(k, data)
-        rows = surfaces.rows(k)
-        upload_emitters(stored[k][0], rows, gain, frame, data, launcher)
+        data.footprint = math.sqrt(area / _TEXTURE_PATCHES)
+        geometry_owners = geometry.fill(k, data)
+        first_triangles = geometry.first_triangles(k)
+        upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
         data.sobol = launcher.array(sobol.sobol_matrices(), wp.uint32)
-        itself = launcher.empty(1, SceneData)
-        data.address = wp.uint64(itself.ptr)  # in the copy as well: what is called by address hands it on
-        itself.assign(launcher.array([data], SceneData))
+        on_device = launcher.empty(1, SceneData)
+        data.address = wp.uint64(on_device.ptr)  # set in the copy as well: functions that read it pass it on
+        on_device.assign(launcher.array([data], SceneData))
         done.append(
             DeviceScene(
                 data=data,
@@ -152,30 +144,57 @@ def _upload(
                 mean_albedo=scene.mean_albedo(),
                 max_albedo=_max_albedo(scene),
                 emits=data.emitter_count > 0,
-                keep=(owners, shapes, itself),
+                owners=(geometry_owners, uploaded.owners, on_device),
                 source=scene,
-                surfaces=surfaces,
-                changes=surfaces.changes,
+                geometry=geometry,
+                geometry_version=geometry.version,
                 stored=stored[k][0],
-                rows=rows,
-                distributions=own,
+                first_triangles=first_triangles,
+                distributions=uploaded.distributions,
                 bounds=(*lower, *upper),
             )
         )
     return done
 
 
+def _upload_lights(
+    scenes: Sequence[Scene],
+    bounds: tuple[Floats, Floats],
+    frame: DeviceFrame,
+    launcher: Launcher,
+    former: list[Distribution2DList],
+) -> list[tuple[SceneData, UploadedLights]]:
+    """A new record with the lights of each shutter sample; those that are the same in several are uploaded once."""
+    lower, upper = bounds
+    extent = float(np.linalg.norm(upper - lower))
+    out: list[tuple[SceneData, UploadedLights]] = []
+    for k, scene in enumerate(scenes):
+        same = next((i for i, other in enumerate(scenes[:k]) if _same_lights(other, scene)), None)
+        if same is not None:
+            out.append((copy_record(out[same][0]), out[same][1]))
+            continue
+        data = SceneData()
+        data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
+        data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
+        # Links name meshes by their index in the user's scene, not in storage order.
+        lights = upload_lights(scene, frame, data, launcher, former)
+        out.append((data, lights))
+        former = [*former, lights.distributions]
+    return out
+
+
 def _max_albedo(scene: Scene) -> float:
-    colors = [x.colors.max() for x in (*scene.meshes, *scene.instances) if x.colors is not None and len(x.colors)]
+    values = [mesh.colors.max() for mesh in scene.meshes if mesh.colors is not None and len(mesh.colors)]
+    values += [group.colors.max() for group in scene.instances if group.colors is not None and len(group.colors)]
     used = {k for m in scene.meshes if m.colors is None for k in materials_of(m)}
-    colors += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
-    return float(max([*colors, *(max(scene.materials[k].albedo) for k in used)], default=0.0))
+    values += [t.pixels.max() for k in used if (t := scene.materials[k].albedo_texture) is not None]
+    return float(max([*values, *(max(scene.materials[k].albedo) for k in used)], default=0.0))
 
 
-def _find(scene: Scene, others: Sequence[DeviceScene]) -> DeviceScene | None:
-    """One of others that differs from a scene in its camera at most."""
-    lit = (o for o in others if same_objects(o.source.lights, scene.lights))
-    return next((o for o in lit if _same_surfaces(o.source, scene)), None)
+def _find_same(scene: Scene, others: Sequence[DeviceScene]) -> DeviceScene | None:
+    """One of `others` that differs from a scene in its camera at most; None: there is none."""
+    candidates = (o for o in others if same_objects(o.source.lights, scene.lights))
+    return next((o for o in candidates if _same_surfaces(o.source, scene)), None)
 
 
 def _same_surfaces(one: Scene, other: Scene) -> bool:
@@ -185,6 +204,7 @@ def _same_surfaces(one: Scene, other: Scene) -> bool:
 
 
 def _same_lights(one: Scene, other: Scene) -> bool:
-    """Whether the tables of lights, and of meshes that are lights, are the same."""
-    lamps = [[(k, id(mesh)) for k, mesh in enumerate(s.meshes) if mesh.light is not None] for s in (one, other)]
-    return same_objects(one.lights, other.lights) and len(one.meshes) == len(other.meshes) and lamps[0] == lamps[1]
+    """Whether two scenes have the same lights and mesh lights."""
+    mesh_lights = [[(k, id(mesh)) for k, mesh in enumerate(s.meshes) if mesh.light is not None] for s in (one, other)]
+    same_meshes = len(one.meshes) == len(other.meshes) and mesh_lights[0] == mesh_lights[1]
+    return same_objects(one.lights, other.lights) and same_meshes

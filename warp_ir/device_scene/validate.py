@@ -1,7 +1,6 @@
-"""What a scene must be before the device sees it."""
+"""Checks of a scene before it is uploaded."""
 
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
 
@@ -10,17 +9,23 @@ from warp_ir.device_scene.geometry_storage import emissive_meshes
 from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000
-"""Above this a scene is refused before anything is allocated."""
+"""Largest number of triangles of a scene; one with more is rejected before anything is allocated."""
 _BYTES_PER_TRIANGLE = 200
 _BYTES_PER_INSTANCE = 400
-_LARGEST_NORMAL = 1.0e6
-"""Of a normal map: its square has to be finite."""
+_MAX_NORMAL_COMPONENT = 1.0e6
+"""Largest component of a normal map, so that its square is finite."""
 
 
 def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
-    """Warp trusts its input: a bad index reads anywhere. So nothing bad may pass here.
+    """Checks shapes, indices, ranges and size of a scene: kernels do not, and a bad index would read any memory.
 
-    `checked` are the ids of meshes and materials that have passed already.
+    Args:
+        scene: The scene.
+        launcher: Launcher of the device, whose memory has to suffice.
+        checked: The ids of meshes and materials that need no check, because they have passed it.
+
+    Raises:
+        InputError: Something is not usable; the message names the mesh, material or light.
     """
     for mesh in scene.meshes:
         if id(mesh) not in checked:
@@ -29,12 +34,12 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
         if used and not 0 <= used[0] <= used[-1] < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     _check_instances(scene)
-    glowing = emissive_meshes(scene)
-    written = [(g, k) for g in scene.instances for k in g.meshes if k in glowing]
-    again = [(len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in written]
-    triangles, instances = scene.triangle_count + sum(again), sum(len(g.matrices) for g in scene.instances)
+    emissive = emissive_meshes(scene)
+    flattened = [(g, k) for g in scene.instances for k in g.meshes if k in emissive]
+    copied = sum((len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in flattened)
+    triangles, instances = scene.triangle_count + copied, sum(len(g.matrices) for g in scene.instances)
     if triangles > MAX_TRIANGLES:
-        copies = f", {sum(again)} of them copies of instances that emit" if again else ""
+        copies = f", {copied} of them copies of instances that emit" if flattened else ""
         raise InputError(f"scene: {triangles} triangles{copies}; the limit is {MAX_TRIANGLES}")
     needed = _BYTES_PER_TRIANGLE * triangles + _BYTES_PER_INSTANCE * instances
     if needed > launcher.memory():
@@ -68,7 +73,7 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
 
 
 def _check_material(material: Material) -> None:
-    def demand(good: Any, what: str) -> None:
+    def demand(good: "bool | np.bool_", what: str) -> None:
         if not good:
             raise InputError(f"{material.name}: {what}")
 
@@ -80,8 +85,8 @@ def _check_material(material: Material) -> None:
         demand(np.isfinite(pixels).all(), f"texture {texture.name}: pixels must be finite")
         signed = texture is material.normal_texture
         demand(signed or pixels.min() >= 0.0, f"texture {texture.name}: pixels must not be negative")
-        usable = not signed or (pixels.shape[2] == 3 and float(np.abs(pixels).max()) <= _LARGEST_NORMAL)
-        demand(usable, f"texture {texture.name}: normals have three channels, each at most {_LARGEST_NORMAL:g}")
+        usable = not signed or (pixels.shape[2] == 3 and float(np.abs(pixels).max()) <= _MAX_NORMAL_COMPONENT)
+        demand(usable, f"texture {texture.name}: normals have three channels, each at most {_MAX_NORMAL_COMPONENT:g}")
         placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
         demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
         demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")
@@ -96,7 +101,7 @@ def _check_instances(scene: Scene) -> None:
     for group in scene.instances:
         count = len(group.matrices)
 
-        def demand(good: Any, what: str, name: str = group.name) -> None:
+        def demand(good: "bool | np.bool_", what: str, name: str = group.name) -> None:
             if not good:
                 raise InputError(f"{name}: {what}")
 
@@ -116,7 +121,7 @@ def _check_instances(scene: Scene) -> None:
 def _check_mesh(mesh: Mesh) -> None:
     count = len(mesh.triangles)
 
-    def demand(good: Any, what: str) -> None:
+    def demand(good: "bool | np.bool_", what: str) -> None:
         if not good:
             raise InputError(f"{mesh.name}: {what}")
 

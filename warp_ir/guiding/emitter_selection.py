@@ -72,4 +72,4 @@ def _with_probabilities(scene: DeviceScene, power: Floats, probability: Floats, 
     device_copy = launcher.empty(1, SceneData)
     data.address = wp.uint64(device_copy.ptr)
     device_copy.assign(launcher.array([data], SceneData))
-    return replace(scene, data=data, keep=(*scene.keep, device_copy))
+    return replace(scene, data=data, owners=(*scene.owners, device_copy))

@@ -18,7 +18,7 @@ _EIGHT_ULP = wp.constant(8.0 * 2.0**-23)
 @wp.func
 def light_texture(scene: SceneData, light: int) -> int:
     """The distribution whose values multiply a light's radiance; -1: none."""
-    if scene.textured_count == 0:
+    if scene.textured_light_count == 0:
         return -1
     return scene.light_tables[0].texture[light]
 

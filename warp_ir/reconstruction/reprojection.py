@@ -182,7 +182,7 @@ def surfaces_move(scenes: Sequence[DeviceScene]) -> bool:
     """Whether surfaces are elsewhere at some moments."""
     first = scenes[0]
     places = [[id(group.matrices) for group in s.stored.instances] for s in scenes]
-    return any(s.rows != first.rows for s in scenes) or any(p != places[0] for p in places)
+    return any(s.first_triangles != first.first_triangles for s in scenes) or any(p != places[0] for p in places)
 
 
 def new_blur(moments: Sequence[ShutterSample], launcher: Launcher) -> Any:
@@ -197,7 +197,13 @@ def new_blur(moments: Sequence[ShutterSample], launcher: Launcher) -> Any:
     shifts = [_shift(scene, middle) for scene in scenes]
     blur.sobol = middle.data.sobol
     blur.moves = int(surfaces_move(scenes) and None not in shifts)
-    moving = [row for s in scenes for a, b in zip(s.rows, middle.rows, strict=False) if a != b for row in (a, b)]
+    moving = [
+        row
+        for s in scenes
+        for a, b in zip(s.first_triangles, middle.first_triangles, strict=False)
+        if a != b
+        for row in (a, b)
+    ]
     blur.first_moving = min(moving, default=2**31 - 1)
     blur.shifts = launcher.array([shift or 0 for shift in shifts], wp.int32)
     return blur
@@ -212,7 +218,7 @@ def _shift(one: DeviceScene, other: DeviceScene) -> int | None:
     for mine, its in zip(a.meshes, b.meshes, strict=True):
         if mine.triangles is not its.triangles and not np.array_equal(mine.triangles, its.triangles):
             return None
-    shifts = {mine - its for mine, its in zip(one.rows, other.rows, strict=True) if mine != its}
+    shifts = {mine - its for mine, its in zip(one.first_triangles, other.first_triangles, strict=True) if mine != its}
     return None if len(shifts) > 1 else next(iter(shifts), 0)
 
 

@@ -104,9 +104,9 @@ def emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
 @wp.func
 def has_camera_emission(scene: SceneData, triangle: int) -> bool:
     """Whether the camera sees another radiance of a triangle than the `emission` that illuminates the scene."""
-    if scene.glow_count == 0:
+    if scene.camera_emission_count == 0:
         return False
-    return scene.surface_textures[0].glow[scene.triangle_material[triangle]][0] >= 0.0
+    return scene.surface_textures[0].camera_emission[scene.triangle_material[triangle]][0] >= 0.0
 
 
 @wp.func
@@ -115,7 +115,7 @@ def camera_emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if hit.front == 0 and scene.emits_back[hit.triangle] == 0:
         return wp.vec3(0.0)
     material = scene.triangle_material[hit.triangle]
-    texture = scene.surface_textures[0].glow_texture[material]
+    texture = scene.surface_textures[0].camera_emission_texture[material]
     if texture >= 0:
         return _texture_at(scene.surface_textures, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
-    return scene.surface_textures[0].glow[material]
+    return scene.surface_textures[0].camera_emission[material]

@@ -40,7 +40,7 @@ def spawn_ray_origin(scene: SceneData, hit: Hit, direction: wp.vec3) -> wp.vec3:
     a = axes * a
     b = axes * b
     c = axes * c
-    error = (_max_coordinate(a, b, c) + scene.instances[hit.instance].size) * _EIGHT_ULP
+    error = (_max_coordinate(a, b, c) + scene.instances[hit.instance].magnitude) * _EIGHT_ULP
     return _offset_point(a, b, c, hit.u, hit.v, direction, error) + scene.instances[hit.instance].centre
 
 

@@ -1,4 +1,4 @@
-"""What a scene will cost, against what it takes."""
+"""The memory estimates of a scene and of a pixel, against the arrays that are allocated."""
 
 import gc
 import json
@@ -13,7 +13,7 @@ from tests.physics.closed_form import placed
 from tests.physics.test_light_control import DOWN, everything, lamp_profile
 from warp_ir.cli import main
 from warp_ir.device.launcher import Launcher
-from warp_ir.device_scene import upload_moments
+from warp_ir.device_scene import upload_scenes
 from warp_ir.memory import pixel_bytes, scene_bytes
 from warp_ir.procedural import cornell_box, furnace, mesh, sphere
 from warp_ir.renderer import Renderer
@@ -21,28 +21,28 @@ from warp_ir.scene import LightKind, Shaping
 
 
 class Counting(Launcher):
-    """Remembers every array that is made."""
+    """A launcher that records every array it allocates."""
 
     def __init__(self, device="cpu", threads=None):
         super().__init__(device, threads)
-        self._made = []
+        self._allocated = []
 
-    def _seen(self, array):
-        self._made.append(weakref.ref(array))
+    def _record_array(self, array):
+        self._allocated.append(weakref.ref(array))
         return array
 
     def empty(self, *args):
-        return self._seen(super().empty(*args))
+        return self._record_array(super().empty(*args))
 
     def zeros(self, *args):
-        return self._seen(super().zeros(*args))
+        return self._record_array(super().zeros(*args))
 
     def array(self, *args):
-        return self._seen(super().array(*args))
+        return self._record_array(super().array(*args))
 
     def alive(self):
         gc.collect()
-        return sum(array.capacity for made in self._made if (array := made()) is not None)
+        return sum(array.capacity for reference in self._allocated if (array := reference()) is not None)
 
 
 def textured():
@@ -84,13 +84,13 @@ def lamps():
 def moving():
     points, triangles = sphere(1.0, level=4)
     still = mesh("still", points, triangles)
-    moments = tuple(ir.Scene((still, mesh("moves", points + k, triangles))) for k in range(4))
-    return ir.Scene(moments[0].meshes, shutter=moments)
+    samples = tuple(ir.Scene((still, mesh("moves", points + k, triangles))) for k in range(4))
+    return ir.Scene(samples[0].meshes, shutter=samples)
 
 
-def moving_below_a_sky():
+def moving_under_a_dome():
     scene, sky = moving(), ir.Light("s", LightKind.DOME, (1,) * 3, texture=np.ones((256, 512, 3), np.float32))
-    return replace(scene, lights=(sky,), shutter=tuple(replace(moment, lights=(sky,)) for moment in scene.shutter))
+    return replace(scene, lights=(sky,), shutter=tuple(replace(sample, lights=(sky,)) for sample in scene.shutter))
 
 
 SCENES = {
@@ -104,22 +104,22 @@ SCENES = {
     "instances that emit": lambda: instanced(emission=1.0, count=20),
     "lamps": lamps,
     "everything": everything,
-    "moments": moving,
-    "moments below a sky": moving_below_a_sky,
+    "shutter samples": moving,
+    "shutter samples under a dome": moving_under_a_dome,
 }
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_the_estimate_is_good_to_a_fifth(scene):
-    """The bytes that are said are those of all arrays of the uploaded scene, within 20 %."""
+    """The estimate equals the bytes of all arrays of the uploaded scene within 20 %."""
     scene = scene()
     launcher = Counting()
-    uploaded = upload_moments(scene.shutter or (scene,), launcher)
+    uploaded = upload_scenes(scene.shutter or (scene,), launcher)
     assert sum(scene_bytes(scene).values()) == pytest.approx(launcher.alive(), rel=0.2)
     del uploaded
 
 
-def mapped():
+def normal_mapped():
     normals = ir.Texture("n", np.full((4, 4, 3), (0.0, 0.0, 1.0)))
     return ir.Scene(furnace(level=1).meshes, (ir.Material("m", normal_texture=normals),))
 
@@ -131,12 +131,12 @@ def through_a_lens():
 
 @pytest.mark.parametrize(
     "scene",
-    [cornell_box(), lamps(), mapped(), through_a_lens(), moving()],
-    ids=["glows", "lamps", "mapped", "lens", "moving"],
+    [cornell_box(), lamps(), normal_mapped(), through_a_lens(), moving()],
+    ids=["visible emission", "lamps", "normal map", "lens", "moving"],
 )
 @pytest.mark.parametrize("settings", [{}, {"filter": False}, {"estimator": "path"}, {"visible_lights": True}], ids=str)
-def test_what_a_pixel_takes(scene, settings, monkeypatch):
-    """By as many bytes a pixel all arrays grow with the picture, once two iterations and a picture have been made."""
+def test_bytes_per_pixel(scene, settings, monkeypatch):
+    """The estimate is the growth of all arrays per added pixel, after two iterations and a resolved picture."""
     monkeypatch.setattr("warp_ir.renderer.Launcher", Counting)
     alive = []
     for width in (16, 48):
@@ -147,8 +147,8 @@ def test_what_a_pixel_takes(scene, settings, monkeypatch):
         picture = film.radiance()
         film.error()
         alive.append(renderer.launcher.alive() + picture.nbytes)
-    said = pixel_bytes(scene, renderer.settings)
-    assert (alive[1] - alive[0]) / (48**2 - 16**2) == pytest.approx(said, rel=0.01)
+    estimate = pixel_bytes(scene, renderer.settings)
+    assert (alive[1] - alive[0]) / (48**2 - 16**2) == pytest.approx(estimate, rel=0.01)
 
 
 LAMP = """#usda 1.0
@@ -165,8 +165,8 @@ def Sphere "Hidden" {
 """
 
 
-def test_info_tells_what_is_skipped_and_guessed(tmp_path, capsys):
-    """The table and --json name what the stage leaves open, what is left out, and what lights are told to do."""
+def test_info_reports_what_is_skipped_and_guessed(tmp_path, capsys):
+    """The table and --json report defaults for what the stage lacks, skipped prims, and the modifiers of lights."""
     file = tmp_path / "a.usda"
     file.write_text(LAMP)
     assert main(["info", str(file), "--json"]) == 0
