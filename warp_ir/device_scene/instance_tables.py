@@ -13,7 +13,7 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.geometry_storage import StoredSample
 from warp_ir.scene import InputError, Instances
-from warp_ir.scene.instances import boxes, cofactors
+from warp_ir.scene.instances import cofactors, transform_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def _upload(
         reach = np.abs(axes) @ half
         size = (np.abs(axes) @ (np.abs(inverse) @ reach[:, :, None]))[:, :, 0].max(axis=1)
         size += np.abs(centre).max(axis=1)
-        lower, upper = boxes(-half, half, _matrices(axes, centre))
+        lower, upper = transform_box(-half, half, _matrices(axes, centre))
         margin = size[:, None] * (16.0 * 2.0**-23)
         table = np.zeros(len(axes), Instance.numpy_dtype())
         table["inverse"], table["centre"], table["size"] = inverse, centre, size

@@ -95,8 +95,8 @@ def shaded(shape: Shape, normals: Floats) -> Shape:
 
 
 def place(shape: Shape, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
-    """Copies of a shape's points, triangles and normals: see `scene.instances.place`."""
-    return instances.place(shape.points, shape.triangles, shape.normals, matrices)
+    """Copies of a shape's points, triangles and normals: see `scene.instances.transform_copies`."""
+    return instances.transform_copies(shape.points, shape.triangles, shape.normals, matrices)
 
 
 def _squared(vectors: Floats) -> Floats:
