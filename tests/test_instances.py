@@ -13,7 +13,7 @@ from warp_ir.procedural import cube, mesh, quad, sphere
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.scene import Instances, Texture
-from warp_ir.scene.instances import areas_of_copies, bounds_of_copies, place
+from warp_ir.scene.instances import areas_of_copies, bounds_of_copies, transform_copies
 from warp_ir.surface import albedo, closest, visible
 
 wp.set_module_options({"enable_backward": False})
@@ -88,7 +88,7 @@ def test_bounds_and_areas_of_many_copies(uneven):
     points, triangles = sphere(level=2)
     matrices = scattered(700, uneven=uneven, seed=3)
     matrices[5, :3, 3] = 3.0
-    placed, wound, _ = place(points, triangles, None, matrices)
+    placed, wound, _ = transform_copies(points, triangles, None, matrices)
     lower, upper = bounds_of_copies(points, matrices)
     np.testing.assert_allclose([lower, upper], [placed.min(axis=0), placed.max(axis=0)], rtol=1e-12)
     a, b, c = (placed[wound[:, k]] for k in range(3))

@@ -275,7 +275,7 @@ def test_a_scene_that_cannot_fit_is_refused_before_it_is_allocated(tmp_path):
 @pytest.fixture
 def shared(monkeypatch):
     """All prototypes in more than one place are stored once, however small they are."""
-    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MOST_WRITTEN", 0)
+    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
 
 
 MOVED = 'double3 xformOp:translate = ({}, {}, {})\n uniform token[] xformOpOrder = ["xformOp:translate"]\n'
@@ -396,7 +396,7 @@ def surfaces(scene: Scene) -> np.ndarray:
 def test_stored_once_is_the_same_as_written_out(tmp_path, name, monkeypatch):
     """Every triangle of every instance has the place, the colour and the light it has when all is written out."""
     flat = load(tmp_path, STAGES[name])
-    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MOST_WRITTEN", 0)
+    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
     scene = load(tmp_path, STAGES[name])
     assert flat.instances == () and bool(scene.instances) == (name != "emissive")
     np.testing.assert_allclose(surfaces(scene.flat()), surfaces(flat), atol=1e-12)
@@ -482,7 +482,7 @@ def test_texture_coordinates_stay_with_their_corners(tmp_path, monkeypatch):
     """In instances, in those written out, mirrored or flattened: what the prim's points have, their copies have."""
     write_image(tmp_path / "a.png", np.full((2, 2, 3), 0.5, np.float32))
     scenes = [load(tmp_path, TEXTURED)]
-    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MOST_WRITTEN", 0)
+    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
     scenes.append(load(tmp_path, TEXTURED))
     assert len(scenes[1].instances[0].matrices) == 2 and scenes[1].stats["textures"] == 1
     for scene in (scenes[0], scenes[1].flat()):

@@ -304,7 +304,7 @@ def test_coordinates_of_another_name(tmp_path, image):
     """A mesh that lacks the set that a material asks for, and has another, is textured by it: named."""
     scene = load(tmp_path, textured() + mesh(ST.replace("primvars:st", "primvars:UVMap")))
     np.testing.assert_array_equal(scene.meshes[0].uvs["st"], load(tmp_path, textured() + mesh()).meshes[0].uvs["st"])
-    assert warned(scene, "/M", "no primvar 'st'", "'UVMap' does")
+    assert warned(scene, "/M", "no primvar 'st'", "'UVMap' is used")
 
 
 @pytest.mark.parametrize(

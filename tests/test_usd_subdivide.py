@@ -369,7 +369,7 @@ def test_broken_surfaces_are_refined_or_dropped(tmp_path, scheme, faces):
 
 def test_too_fine_a_refinement_is_refused_before_it_is_made(tmp_path, monkeypatch):
     """The limit is for all surfaces together; the message names the prim and the remedy."""
-    monkeypatch.setattr(warp_ir.usd.geometry.subdivision, "_MOST_REFINED", 100)
+    monkeypatch.setattr(warp_ir.usd.geometry.subdivision, "_MAX_REFINED_TRIANGLES", 100)
     text = scheme_text(CUBE, CUBE_FACES, name="A") + scheme_text(CUBE, CUBE_FACES, name="B")
     assert len(load(tmp_path, text, complexity="medium").meshes) == 2
     with pytest.raises(InputError, match=r"/A: .* 192 triangles, more than 100: choose a lower complexity"):

@@ -89,7 +89,7 @@ def test_other_layers_are_left_alone(tmp_path):
 @pytest.mark.parametrize("limit", [1, 7, 1000, 33 * 50])
 def test_large_images_are_averaged_down(tmp_path, monkeypatch, tile, limit):
     """No more pixels than allowed, each the mean of a square; tiled or not, in bands of any size."""
-    monkeypatch.setattr("warp_ir.usd.images.asset._BAND", 100)
+    monkeypatch.setattr("warp_ir.usd.images.asset._VALUES_PER_BAND", 100)
     values = np.random.default_rng(1).random((33, 50, 3), np.float32)
     path = str(tmp_path / "a.tif")
     spec = oiio.ImageSpec(50, 33, 3, oiio.FLOAT)

@@ -1,4 +1,4 @@
-"""Scenes made without a file, most of them with an answer known in closed form."""
+"""Procedural scenes; most have a radiance that is known in closed form."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from warp_ir.scene import Camera, Color, Floats, Ints, Light, Material, Mesh, Pr
 
 
 def quad(name: str, corners: object, material: int = 0, *, double_sided: bool = False) -> Mesh:
-    """A quadrilateral of four points [4, 3], counter-clockwise seen from its front."""
+    """A quadrilateral with four corners [4, 3], counter-clockwise seen from its front."""
     return mesh(name, corners, [[0, 1, 2], [0, 2, 3]], material, double_sided=double_sided)
 
 
 def mesh(name: str, points: object, triangles: object, material: int = 0, *, double_sided: bool = False) -> Mesh:
-    """A mesh of one material from anything array-like."""
+    """A mesh of one material from array-like points [n, 3] and triangles [m, 3]."""
     indices = np.asarray(triangles, np.int32).reshape(-1, 3)
     return Mesh(
         name,
@@ -23,7 +23,7 @@ def mesh(name: str, points: object, triangles: object, material: int = 0, *, dou
 
 
 def cube(size: float = 2.0, *, inward: bool = False) -> tuple[Floats, Ints]:
-    """Points [8, 3] and triangles [12, 3] of an axis-aligned cube around the origin."""
+    """Points [8, 3] and triangles [12, 3] of an axis-aligned cube around the origin with edges of length `size`."""
     points = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], np.float64) * (0.5 * size)
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
     triangles = quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np.int32)
@@ -31,7 +31,7 @@ def cube(size: float = 2.0, *, inward: bool = False) -> tuple[Floats, Ints]:
 
 
 def sphere(radius: float = 1.0, level: int = 4, *, inward: bool = False) -> tuple[Floats, Ints]:
-    """Points and triangles of an octahedron subdivided `level` times: 8·4^level triangles, vertices on the sphere."""
+    """Points and triangles of an octahedron subdivided `level` times, vertices on the sphere: 8·4^level triangles."""
     points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     corners = points[faces]
@@ -45,7 +45,7 @@ def sphere(radius: float = 1.0, level: int = 4, *, inward: bool = False) -> tupl
 
 
 def furnace(albedo: float = 0.5, emission: float = 1.0, *, shape: str = "sphere", level: int = 4) -> Scene:
-    """A closed room whose walls all emit and reflect alike, seen from inside: L = Le / (1 - ρ) everywhere."""
+    """A furnace: a closed room with the same emission Le and albedo ρ everywhere, where L = Le / (1 - ρ)."""
     points, triangles = sphere(level=level, inward=True) if shape == "sphere" else cube(inward=True)
     return Scene(
         meshes=(mesh("furnace", points, triangles),),
@@ -56,9 +56,9 @@ def furnace(albedo: float = 0.5, emission: float = 1.0, *, shape: str = "sphere"
 
 
 def floor(light: Light, *, albedo: float = 1.0, size: float = 100.0, height: float = 1.0e-6) -> Scene:
-    """A light over the plane y = 0, seen at the origin from just above: L = ρ E / π, with nothing to bounce from.
+    """A light over the plane y = 0 without interreflection: the image has L = ρ E / π, E the irradiance at the origin.
 
-    The camera is orthographic and its window `height` wide, so that every pixel shows the origin.
+    The orthographic camera looks down from above with a window of width `height`, so that every pixel shows the origin.
     """
     s = 0.5 * size
     plane = quad("floor", [[-s, 0, s], [s, 0, s], [s, 0, -s], [-s, 0, -s]])
@@ -74,7 +74,7 @@ def floor(light: Light, *, albedo: float = 1.0, size: float = 100.0, height: flo
 
 
 def cornell_box(*, light: Color = (17.0, 12.0, 4.0)) -> Scene:
-    """The Cornell box in its published dimensions [mm], with an emissive surface as its light.
+    """The Cornell box in its published dimensions [mm], lit by an emissive surface.
 
     Cornell University Program of Computer Graphics, "Cornell Box Data"; reflectances as commonly rounded to RGB.
     """
@@ -102,7 +102,7 @@ def cornell_box(*, light: Color = (17.0, 12.0, 4.0)) -> Scene:
 
 
 def _block(name: str, base: list[list[int]], height: float) -> Mesh:
-    """A box over four points (x, z) of the floor, without its bottom."""
+    """A box of a given height over four points (x, z) of the floor, without its bottom face."""
     low = [[x, 0.0, z] for x, z in base]
     high = [[x, height, z] for x, z in base]
     quads = [[4, 5, 6, 7], *([(k + 1) % 4, (k + 1) % 4 + 4, k + 4, k] for k in range(4))]

@@ -455,7 +455,7 @@ def PointInstancer "Cloud" {{
     }  # fmt: skip
     expected = reference(mi, scene, 3)
     agree(load(tmp_path, text), expected, 3)
-    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MOST_WRITTEN", 0)
+    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
     stored = load(tmp_path, text)
     assert stored.instances
     agree(stored, expected, 3)

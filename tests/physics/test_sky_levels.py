@@ -212,7 +212,7 @@ def test_links_and_shadows(tmp_path, kind):
 def test_links_to_instances(tmp_path, written, monkeypatch):
     """A light may leave out one of a prototype's instances: that one is black, and casts no shadow if so linked."""
     if not written:
-        monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MOST_WRITTEN", 0)
+        monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
     tile = 'over "Proto" {' + floor(name="Tile", size=0.4) + "}\n"
     for k, place in enumerate([(0, 0, 0), (2, 0, 0), (0, 0.5, 0)]):
         where = at(placed(np.eye(3), place))

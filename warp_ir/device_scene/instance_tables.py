@@ -12,7 +12,7 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.geometry_storage import StoredSample
 from warp_ir.scene import Floats, InputError, Instances
-from warp_ir.scene.instances import boxes, cofactors
+from warp_ir.scene.instances import cofactors, transform_box
 
 _Sources = tuple[tuple[Floats | None, ...], list[tuple[float, ...]]]
 """What instance tables are computed from: arrays, compared as objects, and numbers, compared by value."""
@@ -90,7 +90,7 @@ def _upload(
         reach = np.abs(axes) @ half_extent
         magnitude = (np.abs(axes) @ (np.abs(inverse) @ reach[:, :, None]))[:, :, 0].max(axis=1)
         magnitude += np.abs(centre).max(axis=1)
-        lower, upper = boxes(-half_extent, half_extent, _affine(axes, centre))
+        lower, upper = transform_box(-half_extent, half_extent, _affine(axes, centre))
         margin = magnitude[:, None] * (16.0 * 2.0**-23)
         table = empty_rows(Instance, len(axes))
         table["inverse"], table["centre"], table["magnitude"] = inverse, centre, magnitude

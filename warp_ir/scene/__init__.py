@@ -1,9 +1,10 @@
-"""The scene as the host sees it: frozen records of NumPy arrays, no Warp, no USD."""
+"""The scene on the host: frozen records of NumPy arrays, independent of Warp and USD."""
 
 from warp_ir.scene.camera import CONFORM_POLICIES, MAX_CLIPPING_PLANES, Camera, Projection
 from warp_ir.scene.measure import materials_of
 from warp_ir.scene.scene import Scene
 from warp_ir.scene.types import (
+    Bools,
     Color,
     Floats,
     InputError,
@@ -22,6 +23,7 @@ from warp_ir.scene.types import (
 __all__ = [
     "CONFORM_POLICIES",
     "MAX_CLIPPING_PLANES",
+    "Bools",
     "Camera",
     "Color",
     "Floats",

@@ -1,4 +1,4 @@
-"""The camera: its window, its lens, and how it is fitted to an image of another aspect."""
+"""The camera: window, lens, clipping, and fitting its window to the aspect ratio of an image."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ CONFORM_POLICIES = (
     "adjustApertureHeight",
     "adjustPixelAspectRatio",
 )
-"""How a camera's window meets an image of another aspect (UsdRender's aspectRatioConformPolicy)."""
+"""How a camera's window conforms to an image of another aspect ratio (UsdRender's aspectRatioConformPolicy)."""
 
 
 MAX_CLIPPING_PLANES = 6
-"""Of a `Camera`: as many as a box has sides."""
+"""Maximum number of a `Camera`'s clipping planes: enough for a box."""
 
 
 class Projection(IntEnum):
@@ -38,19 +38,19 @@ class Camera:
     world_from_camera: Floats = field(default_factory=lambda: np.eye(4))
     """float64 [4, 4], rotation and translation only."""
     window: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
-    """left, right, bottom, top of the film: on the plane z = -1 (perspective) or in scene units."""
+    """left, right, bottom, top of the film: on the plane z = -1 (perspective) or in scene units (orthographic)."""
     projection: Projection = Projection.PERSPECTIVE
     clipping: tuple[float, float] = (0.0, math.inf)
-    """Nearest and farthest depth along -Z that camera rays see, in scene units."""
+    """Nearest and farthest depth along -Z at which camera rays hit surfaces, in scene units."""
     exposure: float = 1.0
     """Linear factor on the film's radiance (UsdGeomCamera's exposure controls; 1 by default)."""
     lens_radius: float = 0.0
-    """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole, all is sharp."""
+    """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole camera without defocus."""
     focus_distance: float = 1.0
-    """Depth along -Z at which a camera with a lens is sharp, in scene units."""
+    """Depth along -Z that a camera with a lens has in focus, in scene units."""
     clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
-    """At most `MAX_CLIPPING_PLANES` of (a, b, c, d): camera rays see only where a x + b y + c z + d >= 0, x, y, z being
-    the place in the camera's space."""
+    """At most `MAX_CLIPPING_PLANES` planes (a, b, c, d) in the camera's space: camera rays hit only surfaces where
+    a x + b y + c z + d >= 0."""
 
     @property
     def aspect(self) -> float:
@@ -59,27 +59,27 @@ class Camera:
         return (right - left) / (top - bottom)
 
     def fit(self, width: int, height: int, policy: str = CONFORM_POLICIES[0], pixel_aspect: float = 1.0) -> "Camera":
-        """This camera with its window made to fit an image, about its middle.
+        """This camera with its window fitted, about its centre, to the aspect ratio of an image.
 
         Args:
-            width: Of the image, in pixels.
-            height: Of the image.
+            width: Width of the image in pixels.
+            height: Height of the image in pixels.
             policy: One of `CONFORM_POLICIES`: the window grows (expandAperture), shrinks (cropAperture), changes in
                 one of its sides alone (adjustApertureWidth, adjustApertureHeight), or stays as it is and the pixels
                 are stretched over it (adjustPixelAspectRatio).
             pixel_aspect: Width of a pixel over its height.
         """
         left, right, bottom, top = self.window
-        grow = width / height * pixel_aspect / self.aspect  # 1: it fits already
-        wider, taller = {
-            "expandAperture": (max(grow, 1.0), max(1.0 / grow, 1.0)),
-            "cropAperture": (min(grow, 1.0), min(1.0 / grow, 1.0)),
-            "adjustApertureWidth": (grow, 1.0),
-            "adjustApertureHeight": (1.0, 1.0 / grow),
+        scale = width / height * pixel_aspect / self.aspect  # 1: the window fits as it is
+        scale_x, scale_y = {
+            "expandAperture": (max(scale, 1.0), max(1.0 / scale, 1.0)),
+            "cropAperture": (min(scale, 1.0), min(1.0 / scale, 1.0)),
+            "adjustApertureWidth": (scale, 1.0),
+            "adjustApertureHeight": (1.0, 1.0 / scale),
             "adjustPixelAspectRatio": (1.0, 1.0),
         }[policy]
-        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * wider
-        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * taller
+        x, half_x = 0.5 * (left + right), 0.5 * (right - left) * scale_x
+        y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * scale_y
         return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
 
     @staticmethod
@@ -96,8 +96,8 @@ class Camera:
 
         Args:
             eye: Position, scene units.
-            target: The point in the middle of the picture.
-            up: Any direction that is upright in the picture; not parallel to the view.
+            target: The point in the centre of the image.
+            up: A direction that points upwards in the image; not parallel to the viewing direction.
             fov: Vertical field of view [degrees].
             aspect: Width over height of the window.
             name: A label for messages.
@@ -106,7 +106,7 @@ class Camera:
         back = origin - np.asarray(target, dtype=np.float64)
         right = np.cross(np.asarray(up, dtype=np.float64), back)
         if not (np.linalg.norm(back) > 0.0 and np.linalg.norm(right) > 0.0):
-            raise InputError("camera: eye and target coincide, or up is parallel to the view")
+            raise InputError("camera: eye and target coincide, or up is parallel to the viewing direction")
         back /= np.linalg.norm(back)
         right /= np.linalg.norm(right)
         matrix = np.eye(4)

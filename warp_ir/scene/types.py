@@ -1,7 +1,7 @@
 """The records of a scene: meshes, materials, lights, instances; frozen, NumPy arrays only.
 
-Everything is in world space (meshes that are instanced: in their prototype's) and in scene units (whatever unit
-the stage uses: light transport does not depend on it). Matrices act on column vectors, ``world = matrix @ local``, and
+Coordinates are in world space (those of instanced meshes in their prototype's space) and in scene units: the unit of
+the stage, on which light transport does not depend. Matrices act on column vectors, ``world = matrix @ local``. They
 are float64, so that a scene far from the origin keeps its detail until it is uploaded.
 """
 
@@ -15,26 +15,27 @@ import numpy.typing as npt
 Color = tuple[float, float, float]
 Floats = npt.NDArray[np.floating]
 Ints = npt.NDArray[np.integer]
+Bools = npt.NDArray[np.bool_]
 
 
 class InputError(ValueError):
-    """The user's input cannot be rendered; the message is one line that says what and where."""
+    """The user's input cannot be rendered; the message is one line that names what is wrong and where."""
 
 
 class LightKind(IntEnum):
-    """The shapes a `Light` can have; the comment gives the local shape, as UsdLux defines it."""
+    """The shapes of a `Light`; comments give them in the light's local space, as UsdLux defines it."""
 
     RECT = 0  # width x height in the XY plane, emits along -Z
     DISK = 1  # radius in the XY plane, emits along -Z
     SPHERE = 2  # radius, emits outward
     CYLINDER = 3  # length along X, radius; lateral surface, emits outward
-    POINT = 4  # the limit of a small sphere; emits the same intensity everywhere
-    DISTANT = 5  # shines along -Z from a cone of `angle` degrees (full angle); 0 = parallel
-    DOME = 6  # surrounds the scene
+    POINT = 4  # the limit of a small sphere; emits the same intensity in all directions
+    DISTANT = 5  # emits along -Z, from a cone of directions of full angle `angle` [degrees]; 0: parallel light
+    DOME = 6  # environment light around the scene
 
 
 class Wrap(IntEnum):
-    """What a `Texture` is beyond its edges."""
+    """The values of a `Texture` outside of [0, 1]² (wrap mode)."""
 
     BLACK = 0  # the value `outside`
     CLAMP = 1
@@ -44,31 +45,31 @@ class Wrap(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image on surfaces."""
+    """An image and how it is mapped to surfaces."""
 
     name: str
-    """The asset, or any label for messages."""
+    """Path of the asset, or any label for messages."""
     pixels: Floats
-    """float [h, w, 3] or [h, w, 1], linear, row 0 at the top: the values that the material has, nothing left to do."""
+    """float [h, w, 3] or [h, w, 1], linear, row 0 at the top: the material's final values, scale and bias applied."""
     wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
-    """In the directions of s and t."""
+    """Wrap modes in s and in t."""
     outside: Color = (0.0, 0.0, 0.0)
-    """The value beyond the edges where `wrap` is BLACK."""
+    """The border value, used outside of the image where `wrap` is BLACK."""
     uv: str = "st"
-    """Which of `Mesh.uvs` it is placed by; (0, 0) where a mesh does not have it."""
+    """Name of the texture coordinates in `Mesh.uvs`; a mesh without them has (0, 0) everywhere."""
     transform: Floats = field(default_factory=lambda: np.eye(2, 3))
-    """float64 [2, 3], s and t from (u, v, 1). (0, 0) is the image's lower left corner, (1, 1) its upper right."""
+    """float64 [2, 3]: (s, t) = transform (u, v, 1). (0, 0) is the image's lower left corner, (1, 1) its upper right."""
 
     @property
     def mean(self) -> Color:
-        """Mean of the pixels; grey where there is one channel."""
+        """Mean of the pixels; an image of one channel is grey."""
         red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
         return red, green, blue
 
 
 @dataclass(frozen=True)
 class Material:
-    """A Lambertian surface that may emit. Where a texture is given, its mean replaces the value beside it."""
+    """A Lambertian surface that may emit. The mean of a texture replaces the constant that it stands in for."""
 
     name: str = ""
     """Prim path, or any label for messages."""
@@ -77,19 +78,19 @@ class Material:
     emission: Color = (0.0, 0.0, 0.0)
     """Emitted radiance [W sr⁻¹ m⁻²], the same in all directions of the emitting side."""
     opacity: float = 1.0
-    """In [0, 1]: see `cutoff`."""
+    """Alpha in [0, 1], used as `cutoff` says."""
     cutoff: float = 0.0
-    """The surface is absent where the opacity is less; 0: it is there for that share of the rays."""
+    """Alpha threshold: the surface is absent where the opacity is less. 0: a ray hits it with probability `opacity`."""
     albedo_texture: Texture | None = None
     emission_texture: Texture | None = None
     opacity_texture: Texture | None = None
     glow: Color | None = None
-    """Radiance that the camera sees of the emitting side, where that is not `emission`, by which it lights the scene;
-    None: the same, shaped as the mesh's `MeshLight` has it."""
+    """Radiance of the emitting side as the camera sees it, where it differs from `emission`, which lights the scene;
+    None: `emission`, with the shaping of the mesh's `MeshLight`."""
     glow_texture: Texture | None = None
     normal_texture: Texture | None = None
-    """Normals [x, y, z], of any length, by which the camera sees the surface lit: x where the first of the mesh's
-    texture coordinates grows, y where the second does, z out of the front. Without such coordinates it does nothing."""
+    """Tangent-space normals [x, y, z] of any length: x in the direction in which the texture coordinate u grows, y in
+    that of v, z out of the front. They shade what camera rays hit. A mesh without those coordinates ignores them."""
 
     def __post_init__(self) -> None:
         if self.albedo_texture is not None:
@@ -103,7 +104,7 @@ class Material:
 
     @property
     def textures(self) -> tuple[Texture, ...]:
-        """Those it has."""
+        """All textures of this material."""
         images = (
             self.albedo_texture,
             self.emission_texture,
@@ -116,46 +117,48 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Shaping:
-    """How a light's radiance depends on the direction of emission (UsdLux ShapingAPI), θ being its angle to the axis.
+    """Factors on a light's radiance by the direction of emission (UsdLux ShapingAPI); they multiply.
 
-    The axis is the light's -Z, whatever its shape. Factors multiply.
+    θ is the angle between that direction and the axis: the light's -Z, whatever its shape.
     """
 
     cone_angle: float = 180.0
-    """Half angle [degrees] of the cone outside which the light is dark."""
+    """Half angle [degrees] of the cone outside of which nothing is emitted."""
     cone_softness: float = 0.0
-    """Part of that angle, from 0 to 1, over which the light fades out smoothly."""
+    """Fraction of that angle, in [0, 1], over which emission falls off smoothly to 0."""
     focus: float = 0.0
     """Exponent of the factor |cosθ|^focus."""
     focus_tint: Color = (0.0, 0.0, 0.0)
-    """What the focus fades to: the factor is |cosθ|^focus + (1 - |cosθ|^focus) · focus_tint."""
+    """Tint off the axis: the factor becomes |cosθ|^focus + (1 - |cosθ|^focus) · focus_tint."""
     profile: Floats | None = None
-    """Photometry of a lamp, [rows, columns]: the factor at the middle of cells that divide θ from 0° to 180° and the
-    azimuth from 0° to 360°, from the light's +X towards its +Y; interpolated between them."""
+    """Photometric profile (IES), [rows, columns]: factors at the centres of cells. Rows divide θ from 0° to 180°,
+    columns the azimuth from 0° to 360°, counted from the light's +X towards its +Y; interpolated in between."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshLight:
-    """What makes a light of a mesh whose materials emit, beyond that (UsdLux MeshLightAPI)."""
+    """Light attributes of a mesh whose materials emit: shaping, light linking, shadows (UsdLux MeshLightAPI)."""
 
     name: str = ""
     """Prim path of the light, or any label for messages."""
     world_from_light: Floats = field(default_factory=lambda: np.eye(4))
     """float64 [4, 4]; its -Z is the axis of the shaping."""
     shaping: Shaping | None = None
-    """Multiplies the radiance that the materials emit; None: the same in all directions."""
+    """Factors on the emitted radiance; None: the same radiance in all directions."""
     shadows: bool = True
-    """As for `Light`, and so are the other two."""
+    """Defined like `Light.shadows`."""
     unlit: frozenset[int] = frozenset()
+    """Defined like `Light.unlit`."""
     shadowless: frozenset[int] = frozenset()
+    """Defined like `Light.shadowless`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles in world space, or in the space of the prototype that they are part of (`Instances`).
 
-    Surfaces reflect and block on both sides. The winding (counter-clockwise seen from the front)
-    decides only which side emits, and where the geometric normal points.
+    Surfaces reflect light and occlude on both sides. The winding (counter-clockwise seen from the front) decides only
+    from which side they emit and where the geometric normal points.
     """
 
     name: str
@@ -167,49 +170,49 @@ class Mesh:
     material: Ints
     """int32 [m], indices into `Scene.materials`."""
     normals: Floats | None = None
-    """float32 [m, 3, 3], unit shading normals of the triangles' corners; None: faceted."""
+    """float32 [m, 3, 3], unit shading normals at the triangles' corners; None: the geometric normals."""
     colors: Floats | None = None
-    """float32 [m, 3, 3], albedo of the triangles' corners, in place of the material's; None: the material's."""
+    """float32 [m, 3, 3], albedo at the triangles' corners, which replaces the material's; None: the material's."""
     double_sided: bool = False
     """Whether an emissive material emits from the back as well."""
     uvs: Mapping[str, Floats] = field(default_factory=dict)
-    """Texture coordinates of the triangles' corners by name, float32 [m, 3, 2]."""
-    bare: npt.NDArray[np.bool_] | None = None
-    """bool [m], triangles that take the colour of their instance where `Instances.colors` has one; None: none do."""
+    """Texture coordinates at the triangles' corners by name, float32 [m, 3, 2]."""
+    bare: Bools | None = None
+    """bool [m], triangles whose albedo is that of their instance where `Instances.colors` is given; None: none."""
     tangents: Floats | None = None
-    """float32 [m, 3, 3], directions in which u grows at the corners, for normal maps; None: each triangle's own."""
+    """float32 [m, 3, 3], tangents at the corners for normal maps: directions in which u grows; None: per triangle."""
     light: MeshLight | None = None
-    """Shaping, links and shadows of what its materials emit; None: it emits all around, lights everything, and
-    everything shadows it."""
+    """Shaping, light linking and shadows of its emission; None: it emits in all directions, lights all meshes, and all
+    meshes cast shadows in its light."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Meshes that are stored once and seen in many places."""
+    """A prototype: meshes that are stored once, and the transforms of its instances."""
 
     name: str
     """Path of the prototype, or any label for messages."""
     meshes: tuple[int, ...]
-    """Indices into `Scene.meshes`; a mesh is part of one `Instances` at most, and then not seen by itself."""
+    """Indices into `Scene.meshes`; a mesh is part of at most one `Instances`, whose instances alone are rendered."""
     matrices: Floats
-    """world_from_prototype, float64 [k, 4, 4], invertible; mirrored and sheared ones are fine."""
+    """world_from_prototype, float64 [k, 4, 4], invertible; they may mirror and shear."""
     colors: Floats | None = None
-    """float32 [k, 3], albedo of the triangles that `Mesh.bare` selects; None: their material's."""
+    """float32 [k, 3], albedo per instance of the triangles that `Mesh.bare` selects; None: their material's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A light that is not a surface of the scene: it casts light, blocks none, reflects none."""
+    """A light that is no surface of the scene: it emits, but neither occludes nor reflects."""
 
     name: str
     """Prim path, or any label for messages."""
     kind: LightKind
-    """Which of the dimensions below count."""
+    """Shape of the light; it decides which of the dimensions below are used."""
     radiance: Color
     """Emitted radiance [W sr⁻¹ m⁻²]; for POINT the intensity [W sr⁻¹]; for DISTANT with angle 0 the
     irradiance [W m⁻²] on a surface that faces the light."""
     world_from_light: Floats = field(default_factory=lambda: np.eye(4))
-    """float64 [4, 4]; scale and shear allowed for the shapes with an area, ignored by DISTANT and DOME."""
+    """float64 [4, 4]; shapes with an area may be scaled and sheared, DISTANT and DOME use only the rotation."""
     width: float = 1.0
     height: float = 1.0
     radius: float = 0.5
@@ -217,14 +220,14 @@ class Light:
     angle: float = 0.53
     """Full angle of a DISTANT light's cone [degrees]."""
     texture: Floats | None = None
-    """float32 [h, w, 3], multiplies the radiance of a RECT or DOME light, bilinear between texels. On a rectangle row 0
-    is at +Y and column 0 at +X: upright and unmirrored on the side that is lit. On a dome row 0 is around +Y, and the
-    columns go round from -Z by way of +X, +Z and -X."""
+    """float32 [h, w, 3], factor on the radiance of a RECT or DOME light, bilinearly interpolated. On a rectangle row 0
+    is at +Y and column 0 at +X: upright and unmirrored seen from the side that emits. On a dome (latitude-longitude)
+    row 0 is at +Y, and columns run from -Z over +X, +Z and -X back to -Z."""
     shaping: Shaping | None = None
     """None: the same radiance in all directions."""
     shadows: bool = True
-    """False: nothing shadows its direct light, what the camera sees of it; light by way of surfaces is always real."""
+    """False: its direct light at points that the camera sees is unoccluded. Indirect light always casts shadows."""
     unlit: frozenset[int] = frozenset()
-    """Indices of the `Scene.meshes` that it does not light."""
+    """Indices of the `Scene.meshes` that it does not illuminate (light linking)."""
     shadowless: frozenset[int] = frozenset()
-    """Indices of the `Scene.meshes` that its light passes through as if they were not there."""
+    """Indices of the `Scene.meshes` that cast no shadow in its light (shadow linking)."""

@@ -6,16 +6,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdLux
 
-from warp_ir.scene import Floats, Instances, Ints, Material, Mesh
+from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
-from warp_ir.usd.geometry.instancing import Level, combined, combined_colors
+from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 from warp_ir.usd.geometry.mesh import read_mesh, read_tet_mesh
-from warp_ir.usd.geometry.prototypes import MOST_WRITTEN, Group, Part, digest, fit_for_rays, share
-from warp_ir.usd.geometry.skinning import Skinning, sharing_key
+from warp_ir.usd.geometry.prototypes import (
+    MAX_FLATTENED_TRIANGLES,
+    InstancedGprim,
+    LevelGroup,
+    choose_storage,
+    digest,
+    well_conditioned,
+)
+from warp_ir.usd.geometry.skinning import Skinning, pose_key
 from warp_ir.usd.geometry.tangents import smooth_tangents
-from warp_ir.usd.images.cache import Images
-from warp_ir.usd.images.shading_value import Signal
+from warp_ir.usd.images.cache import ImageCache
+from warp_ir.usd.images.shading_value import ShadingValue
 from warp_ir.usd.lights.mesh_light import LAMP_UV, Lamp
 from warp_ir.usd.linking import Linking
 from warp_ir.usd.shading.binding import PURPOSES
@@ -24,9 +31,9 @@ from warp_ir.usd.traverse import LIGHT_COPIES, Site
 from warp_ir.usd.values import read
 from warp_ir.usd.values.primvar import texture_coordinates
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.triangles import Mask, Shape, cross_products, place, without_slivers
+from warp_ir.usd.values.triangles import TriangleMesh, cross_products, drop_degenerate, instantiate
 
-_Shapes = dict[tuple[Sdf.Path, ...], Shape | None]
+_Shapes = dict[tuple[Sdf.Path, ...], TriangleMesh | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +50,7 @@ class _Gprim:
     """A gprim as it was read."""
 
     site: Site
-    shape: Shape
+    shape: TriangleMesh
     look: Look
     emits: bool
 
@@ -54,7 +61,7 @@ class _Prototype:
 
     matrices: Floats
     colors: Floats | None
-    fit: Mask
+    fit: Bools
     """Which of its places can be instances; the others are written out."""
     meshes: list[int] = field(default_factory=list)
 
@@ -65,7 +72,7 @@ def build_meshes(
     report: Report,
     levels: int = 0,
     shapes: _Shapes | None = None,
-    images: Images | None = None,
+    images: ImageCache | None = None,
     metals: str = "diffuse",
     purposes: Sequence[str] = PURPOSES[:2],
     linking: Linking | None = None,
@@ -107,22 +114,22 @@ class _Builder:
         self._linking = linking
         self._skinning = Skinning(time, report)
         self._shapes = shapes
-        self._seen: dict[tuple[object, ...], tuple[Shape, Look, bool]] = {}
+        self._seen: dict[tuple[object, ...], tuple[TriangleMesh, Look, bool]] = {}
         self._known: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
         self._lamps: dict[Sdf.Path, Lamp] = {}
-        self._painted: dict[tuple[int, Hashable], Level] = {}
+        self._painted: dict[tuple[int, Hashable], InstanceLevel] = {}
         self._dressed: dict[tuple[int, int], Look] = {}
 
     def run(self, sites: Sequence[Site]) -> Geometry:
         self._table.resolve([site.prim for site in sites])
         gprims = [gprim for site in sites if (gprim := self._gprim(site)) is not None]
-        parts = [Part(g.site.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
+        parts = [InstancedGprim(g.site.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
         meshes: list[Mesh] = []
         prototypes: dict[int, _Prototype] = {}
-        for drawn in share(parts, self._report.source):
-            gprim, home = gprims[drawn.part], drawn.group
-            places = combined(level.matrices for level in drawn.levels)
-            colors = combined_colors((len(level.matrices), level.colors) for level in drawn.levels)
+        for drawn in choose_storage(parts, self._report.source):
+            gprim, home = gprims[drawn.gprim], drawn.prototype
+            places = nested_transforms(level.matrices for level in drawn.levels)
+            colors = nested_colors((len(level.matrices), level.colors) for level in drawn.levels)
             if home is None:
                 for chosen in self._apart(gprim, places):
                     self._add(meshes, self._mesh(gprim, places[chosen], None if colors is None else colors[chosen]))
@@ -178,7 +185,7 @@ class _Builder:
             self._seen[key] = (shape, look, max(emission, default=0.0) > 0.0)
         shape, look, emits = self._seen[key]
         absent = len(whole.triangles) - len(shape.triangles)
-        self._report.stats["triangles_absent"] += absent * site.level.total
+        self._report.stats["triangles_absent"] += absent * site.level.instance_count
         if len(shape.triangles) == 0:
             return None
         site, look = self._with_instance_primvars(site, look)
@@ -202,7 +209,7 @@ class _Builder:
             self._dressed[key] = replace(look, bare=look.asked[found[0]][0])
         return replace(site, level=levels[found[0]]), self._dressed[key]
 
-    def _paint(self, level: Level, albedo: Signal) -> Level:
+    def _paint(self, level: InstanceLevel, albedo: ShadingValue) -> InstanceLevel:
         """A level with the colours that an albedo has in its places, and so all levels that it is in."""
         if level.parent is None:
             return level
@@ -215,7 +222,7 @@ class _Builder:
                 }
                 values = {asked: rows for asked, rows in by_name.items() if rows is not None}
                 if values:
-                    colors = np.broadcast_to(albedo.at(values), (len(level.matrices), 3)).clip(0.0, 1.0)
+                    colors = np.broadcast_to(albedo.evaluate(values), (len(level.matrices), 3)).clip(0.0, 1.0)
             parent = self._paint(level.parent, albedo)
             self._painted[key] = replace(level, key=(level.key, albedo.key), parent=parent, colors=colors)
         return self._painted[key]
@@ -248,45 +255,45 @@ class _Builder:
         links = self._linking.of(gprim.site.prim.GetPath())
         return id(gprim.shape), id(gprim.look), digest(gprim.site.local), links
 
-    def _prototype(self, group: Group, gprim: _Gprim) -> _Prototype:
-        matrices = group.matrices()
+    def _prototype(self, group: LevelGroup, gprim: _Gprim) -> _Prototype:
+        matrices = group.world_matrices()
         finite = np.isfinite(matrices).all(axis=(1, 2))
         if not finite.all():
             self._report.warn(
                 gprim.site.prim.GetPath(), "{n} instances with infinite transforms left out", int((~finite).sum())
             )
-        colors = group.colors()
+        colors = group.world_colors()
         matrices, colors = matrices[finite], None if colors is None else colors[finite]
-        return _Prototype(matrices, colors, fit_for_rays(matrices))
+        return _Prototype(matrices, colors, well_conditioned(matrices))
 
     def _unfit(self, gprim: _Gprim, prototype: _Prototype, places: Floats, colors: Floats | None) -> Mesh | None:
         """The copies whose matrices collapse the prototype, or nearly, in the world."""
         matrices = prototype.matrices[~prototype.fit]
-        if len(matrices) * len(places) * len(gprim.shape.triangles) > MOST_WRITTEN:
+        if len(matrices) * len(places) * len(gprim.shape.triangles) > MAX_FLATTENED_TRIANGLES:
             path = gprim.site.prim.GetPath()
             self._report.warn(path, "{n} instances with singular transforms left out", len(matrices))
             return None
         outer = None if prototype.colors is None else prototype.colors[~prototype.fit]
-        given = combined_colors([(len(matrices), outer), (len(places), colors)])
-        return self._mesh(gprim, combined([matrices, places]), given)
+        given = nested_colors([(len(matrices), outer), (len(places), colors)])
+        return self._mesh(gprim, nested_transforms([matrices, places]), given)
 
-    def _shape(self, prim: Usd.Prim) -> Shape | None:
+    def _shape(self, prim: Usd.Prim) -> TriangleMesh | None:
         """The prim's triangles in its own space; instances of the same prototype share them."""
         shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
-        key = (shared, *sharing_key(prim))
+        key = (shared, *pose_key(prim))
         if key not in self._shapes:
             try:
                 shape = self._read(prim)
             except Unreadable as trouble:
                 self._report.warn(prim.GetPath(), f"{trouble}; the prim is skipped")
                 shape = None
-            if shape is not None and shape.degenerate:
-                self._report.warn(prim.GetPath(), "{n} degenerate faces left out", shape.degenerate)
-                self._report.stats["degenerate_faces"] += shape.degenerate
+            if shape is not None and shape.degenerate_faces:
+                self._report.warn(prim.GetPath(), "{n} degenerate faces left out", shape.degenerate_faces)
+                self._report.stats["degenerate_faces"] += shape.degenerate_faces
             self._shapes[key] = shape if shape is not None and len(shape.triangles) else None
         return self._shapes[key]
 
-    def _read(self, prim: Usd.Prim) -> Shape | None:
+    def _read(self, prim: Usd.Prim) -> TriangleMesh | None:
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if kind in IMPLICIT:
             return read_implicit(prim, kind, self._time)
@@ -316,14 +323,14 @@ class _Builder:
         material, colors = np.tile(look.material, copies), self._colors(look, given, copies)
         uvs = {name: np.tile(corners, (copies, 1, 1)) for name, corners in look.uvs.items()}
         mirrored = np.repeat(np.linalg.det(matrices[:, :3, :3]) < 0.0, len(shape.triangles))
-        if mirrored.any():  # `place` has turned their corners round
+        if mirrored.any():  # `instantiate` has reversed their winding
             for corners in (*uvs.values(), *([] if colors is None else [colors])):
                 corners[mirrored] = corners[mirrored][:, ::-1]
         bare = np.tile(look.bare, copies) if shared and look.bare is not None else None
         if (np.linalg.det(matrices[:, :3, :3]) == 0.0).any():
             # A flattened copy keeps the triangles that still have an area.
             order = np.arange(len(triangles))
-            kept = without_slivers(Shape(points, triangles, order, triangles, normals))
+            kept = drop_degenerate(TriangleMesh(points, triangles, order, triangles, normals))
             triangles, material = kept.triangles, material[kept.face]
             normals = None if kept.normals is None else _or_geometric(kept.normals, points, triangles)
             colors = None if colors is None else colors[kept.face]
@@ -364,13 +371,13 @@ class _Builder:
             tangents[chosen] = smooth_tangents(points, *of_these)
         return tangents
 
-    def _placed(self, shape: Shape, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
+    def _placed(self, shape: TriangleMesh, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
         """Copies of a shape; the same arrays for prototypes of the same geometry, which then share their tree."""
         if not shared:
-            return place(shape, matrices)
+            return instantiate(shape, matrices)
         key = (id(shape.points), digest(shape.triangles), digest(matrices))
         if key not in self._known:
-            self._known[key] = place(shape, matrices)
+            self._known[key] = instantiate(shape, matrices)
         return self._known[key]
 
     def _colors(self, look: Look, given: Floats | None, copies: int) -> Floats | None:

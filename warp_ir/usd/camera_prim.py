@@ -182,7 +182,7 @@ def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
 def _clipping(camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report) -> tuple[float, float]:
     near_far = read.raw(camera.GetClippingRangeAttr(), time)
     try:
-        near, far = (float(distance) for distance in near_far)
+        near, far = (float(distance) for distance in np.asarray(near_far).reshape(-1))
     except (TypeError, ValueError):
         near, far = math.nan, math.nan
     if not (near < far and far > 0.0):

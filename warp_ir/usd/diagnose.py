@@ -77,7 +77,7 @@ def _winding(a: Floats, b: Floats, c: Floats) -> float:
 def explain_dark_lights(prims: Sequence[Usd.Prim], time: Usd.TimeCode, report: Report) -> None:
     """Says of lights that emit nothing which of their inputs has it so; of others more has been said already."""
     for prim in prims:
-        inputs = Inputs(prim, time, report.part())
+        inputs = Inputs(prim, time, report.section())
         with suppress(Unreadable):
             for name, default in (("intensity", 50000.0 if prim.IsA(UsdLux.DistantLight) else 1.0), ("diffuse", 1.0)):
                 number = inputs.number(name, default)

@@ -14,7 +14,7 @@ from warp_ir.scene import InputError, Light, LightKind, Scene
 from warp_ir.usd.assemble import Geometry, build_meshes
 from warp_ir.usd.camera_prim import find_camera, framing_camera, read_camera, read_shutter, standing_camera
 from warp_ir.usd.diagnose import explain_blackness, explain_dark_lights
-from warp_ir.usd.images.cache import Images
+from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.lights.light import LIGHTS, read_light
 from warp_ir.usd.linking import Linking, link
 from warp_ir.usd.settings.render_pass import find_render_pass
@@ -159,7 +159,7 @@ class StageReader:
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _LEVELS[complexity]
         self._opened = Report(self.source, strict=strict)
-        self._metals, self._images = metals, Images(self._opened, texture_wrap)
+        self._metals, self._images = metals, ImageCache(self._opened, texture_wrap)
         with self._reading():
             self.stage = open_stage(
                 self.source,
@@ -176,7 +176,7 @@ class StageReader:
             self._motion = Motion(self.stage)
         self._still: _Still | None = None
         self._shapes: dict[Any, Any] = {}
-        self._moved = self._opened.part()
+        self._moved = self._opened.section()
 
     def spec(self, time: float | str | None = None) -> RenderSpec:
         """What the stage's render settings ask for.
@@ -185,7 +185,9 @@ class StageReader:
             InputError: There are no render settings of the given name.
         """
         with self._reading():
-            return read_render_spec(self.stage, self._render_settings, time_code(self.stage, time), self._opened.part())
+            return read_render_spec(
+                self.stage, self._render_settings, time_code(self.stage, time), self._opened.section()
+            )
 
     def read(self, time: float | str | None = None, product: Product | None = None) -> Scene:
         """The scene at a moment.
@@ -201,7 +203,7 @@ class StageReader:
             raise InputError(f"time: {time} is not a finite number")
         with self._reading():
             code = time_code(self.stage, time)
-            report = self._opened.part()
+            report = self._opened.section()
             report.include(self._opened)
             spec = read_render_spec(self.stage, self._render_settings, code, report)
             wanted = product or spec.products[0]
@@ -245,7 +247,7 @@ class StageReader:
         if count < _SLICES:
             report.warn(camera.GetPath(), f"motion blur of {count} moments, not {_SLICES}: what moves is large")
         moments = [time + opens + (k + 0.5) / count * (closes - opens) for k in range(count)]
-        unsaid = self._opened.part()
+        unsaid = self._opened.section()
         return tuple(self._scene(Usd.TimeCode(moment), camera, spec, unsaid) for moment in moments)
 
     def _scene(self, time: Usd.TimeCode, camera: Usd.Prim | None, spec: RenderSpec, report: Report) -> Scene:
@@ -259,10 +261,10 @@ class StageReader:
         geometry, lights = still.geometry, still.lights
         report.include(still.report)
         if still.moving.shapes or still.moving.lights:
-            moved = self._opened.part()
+            moved = self._opened.section()
             geometry = self._with_moving(still, time, moved)
             lights = lights + _lights(still.moving.lights, time, moved)
-            moved.mention(self._moved)  # a shape that is known already does not tell again what it lacks
+            moved.include_new(self._moved)  # a shape that is known already does not tell again what it lacks
             report.include(moved)
             self._moved = moved
         meshes, materials = geometry.meshes, geometry.materials
@@ -302,7 +304,7 @@ class StageReader:
 
     def _walk(self, time: Usd.TimeCode, key: tuple[Any, ...]) -> "_Still":
         """What is drawn, and where; what stays the same at all times is read the first time."""
-        report = self._opened.part()
+        report = self._opened.section()
         found = walk(self.stage, time, key[:-2], report, self._pass)
         moving, staying = Found(), Found()
         for name in ("shapes", "lights"):
@@ -312,7 +314,7 @@ class StageReader:
         lamps = [site.lamp or site.prim for site in (*found.lights, *found.shapes)]
         linking = Linking(prim for prim in lamps if prim.HasAPI(UsdLux.LightAPI))
         if self._still is None or key != self._still.key or linking.rules != self._still.linking.rules:
-            read = self._opened.part()
+            read = self._opened.section()
             geometry = build_meshes(
                 staying.shapes,
                 time,

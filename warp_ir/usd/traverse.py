@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Floats
 from warp_ir.usd.geometry.implicit import IMPLICIT
-from warp_ir.usd.geometry.instancing import Level, read_instancer
+from warp_ir.usd.geometry.instancing import InstanceLevel, read_instancer
 from warp_ir.usd.lights.light import LIGHTS
 from warp_ir.usd.settings.render_pass import RenderPass
 from warp_ir.usd.values import read
@@ -24,7 +24,7 @@ _NOTES = ("HoudiniLayerInfo",)
 """Types of other programs that are no part of a scene."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
-_WORLD = Level(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
+_WORLD = InstanceLevel(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
 _SHAPES = {"Mesh", "TetMesh", *IMPLICIT}
 _DRAWN = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 # A prototype may live below an `over` or a `class`, which keeps it from being drawn where it stands.
@@ -36,7 +36,7 @@ class Site:
     """A prim and the places where it is drawn."""
 
     prim: Usd.Prim
-    level: Level
+    level: InstanceLevel
     """The prototype that it is part of; the outermost is the world."""
     local: Floats
     """level_from_prim, float64 [4, 4]."""
@@ -47,7 +47,7 @@ class Site:
     @property
     def matrices(self) -> Floats:
         """world_from_prim for every place, float64 [k, 4, 4]."""
-        return self.level.in_world() @ self.local
+        return self.level.world_matrices() @ self.local
 
 
 @dataclass(eq=False)
@@ -63,7 +63,7 @@ class _Visit:
     """A prim still to be visited, with what it inherits."""
 
     prim: Usd.Prim
-    level: Level
+    level: InstanceLevel
     local: Floats
     purpose: object | None
     instancers: tuple[Sdf.Path, ...]
@@ -126,7 +126,7 @@ class _Walk:
             level, local = self._placed(prim, level, local)
         if prim.IsInstance():
             report.stats["native_instances"] += 1
-            level, local = Level(prim.GetPrototype().GetPath(), level, local[None]), np.eye(4)
+            level, local = InstanceLevel(prim.GetPrototype().GetPath(), level, local[None]), np.eye(4)
         kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if not kind and prim.GetTypeName() not in ("", *_NOTES):
             self._foreign[prim.GetPath()] = prim.GetTypeName()
@@ -167,7 +167,7 @@ class _Walk:
             children = children[default if isinstance(default, int) and 0 <= default < len(children) else 0 :][:1]
         return [_Visit(child, level, local, purpose, visit.instancers) for child in children]
 
-    def _placed(self, prim: Usd.Prim, level: Level, parent: Floats) -> tuple[Level, Floats]:
+    def _placed(self, prim: Usd.Prim, level: InstanceLevel, parent: Floats) -> tuple[InstanceLevel, Floats]:
         """The level of a prim and its place in it, level_from_prim [4, 4], given those of its parent."""
         try:
             local, resets = self._transforms.GetLocalTransformation(prim)
@@ -212,8 +212,10 @@ class _Walk:
         return bool(purpose == UsdGeom.Tokens.guide)
 
     def _add_light(self, site: Site) -> None:
-        if site.level.total > LIGHT_COPIES:
-            self._report.warn(site.prim.GetPath(), f"{site.level.total} copies of a light: too many, it is left out")
+        if site.level.instance_count > LIGHT_COPIES:
+            self._report.warn(
+                site.prim.GetPath(), f"{site.level.instance_count} copies of a light: too many, it is left out"
+            )
         else:
             self._found.lights.append(site)
 
@@ -236,7 +238,7 @@ class _Walk:
             shapes = [replace(site, lamp=lamps.get(site.prim.GetPath())) for site in self._found.shapes]
             self._found.shapes = shapes
 
-    def _instances(self, visit: _Visit, level: Level, local: Floats, purpose: object | None) -> list[_Visit]:
+    def _instances(self, visit: _Visit, level: InstanceLevel, local: Floats, purpose: object | None) -> list[_Visit]:
         """The prototypes of a point instancer, each with all its places."""
         prim, report = visit.prim, self._report
         path = prim.GetPath()
@@ -259,9 +261,9 @@ class _Walk:
                     path, f"its prototype {group.prototype} holds the instancer itself, or leads back to it; left out"
                 )
                 continue
-            report.stats["point_instances"] += level.total * len(group.matrices)
+            report.stats["point_instances"] += level.instance_count * len(group.matrices)
             key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
-            inner = Level(key, level, local @ group.matrices, group.colors, group.primvars)
+            inner = InstanceLevel(key, level, local @ group.matrices, group.colors, group.primvars)
             # What lies above a prototype gives it no place and hides it not, but a purpose.
             own = UsdGeom.Imageable(prototype).ComputePurposeInfo() if prototype.IsA(UsdGeom.Imageable) else None
             inherited = own if own is not None and own.isInheritable else purpose

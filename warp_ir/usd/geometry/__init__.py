@@ -1,1 +1,1 @@
-"""Geometry prims to triangles: meshes, implicit shapes, subdivision, skinning, instancing, velocities."""
+"""Geometry prims as triangles: meshes, implicit shapes, subdivision, skinning, instancing, velocities."""

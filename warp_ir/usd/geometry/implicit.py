@@ -1,6 +1,6 @@
-"""UsdGeom's implicit shapes, tessellated with the exact normals of the smooth surface.
+"""UsdGeom's implicit shapes, tessellated, with the exact normals of the smooth surface.
 
-Everything round is a lathe: a profile of arcs (r, z) with their normals, turned about an axis.
+Round shapes are surfaces of revolution: a profile of arcs (r, z) with normals, revolved about an axis.
 """
 
 import math
@@ -10,19 +10,19 @@ from dataclasses import replace
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from warp_ir.scene import Floats
+from warp_ir.scene import Floats, Ints
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Unreadable
-from warp_ir.usd.values.triangles import Shape
+from warp_ir.usd.values.triangles import TriangleMesh
 
 _SEGMENTS = 72
-"""Around the axis, and half as many from pole to pole: the area of a sphere is short by 0.16 %."""
+"""Segments around the axis, and half as many from pole to pole: the area of a sphere is 0.16 % too small."""
 
 Profile = Sequence[Floats]
-"""Arcs from the bottom up, outward on the right: each float64 [p, 4] with columns r, z and the normal's r, z."""
+"""Arcs from bottom to top, outside at larger r: each float64 [p, 4] with columns r, z and the normal's r, z."""
 
 
-def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> Shape:
+def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> TriangleMesh:
     """The triangles of a Sphere, Cube, Cylinder, Cylinder_1, Cone, Capsule, Capsule_1 or Plane.
 
     Raises:
@@ -41,48 +41,48 @@ def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> Shape:
     shape = IMPLICIT[kind](size)
     if len(shape.triangles) == 0:
         raise Unreadable("the shape has no area")
-    # Cyclic permutations turn +Z into the axis and keep the handedness.
-    turn = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]
+    # Cyclic permutations of the axes map +Z to the axis and keep the handedness.
+    permutation = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]
     if kind == "Plane" and axis != "Z":
-        # The schema's plane across X has its width along Z, across Y its width along X.
-        turn = {"X": [2, 1, 0], "Y": [0, 2, 1]}[axis]
-    normals = None if shape.normals is None else shape.normals[:, :, turn]
+        # By the schema, the plane across X has its width along Z, the plane across Y its width along X.
+        permutation = {"X": [2, 1, 0], "Y": [0, 2, 1]}[axis]
+    normals = None if shape.normals is None else shape.normals[:, :, permutation]
     triangles = shape.triangles[:, ::-1] if kind == "Plane" and axis != "Z" else shape.triangles
-    shape = Shape(shape.points[:, turn], triangles, shape.face, shape.corner, normals)
+    shape = TriangleMesh(shape.points[:, permutation], triangles, shape.face, shape.corner, normals)
     left_handed = read.text(prim.GetAttribute("orientation"), time) == UsdGeom.Tokens.leftHanded
-    return _inside_out(shape) if left_handed else shape
+    return _reversed(shape) if left_handed else shape
 
 
 Size = Callable[[str, float], float]
 
 
-def _sphere(size: Size) -> Shape:
+def _sphere(size: Size) -> TriangleMesh:
     return _lathe([_arc(size("radius", 1.0), 0.0, -90.0, 90.0)])
 
 
-def _cylinder(size: Size) -> Shape:
+def _cylinder(size: Size) -> TriangleMesh:
     radius = size("radius", 1.0)
     return _frustum(radius, radius, size("height", 2.0))
 
 
-def _cylinder_1(size: Size) -> Shape:
+def _cylinder_1(size: Size) -> TriangleMesh:
     return _frustum(size("radiusBottom", 1.0), size("radiusTop", 1.0), size("height", 2.0))
 
 
-def _cone(size: Size) -> Shape:
+def _cone(size: Size) -> TriangleMesh:
     return _frustum(size("radius", 1.0), 0.0, size("height", 2.0))
 
 
-def _capsule(size: Size) -> Shape:
+def _capsule(size: Size) -> TriangleMesh:
     radius = size("radius", 0.5)
     return _capped(radius, radius, size("height", 1.0))
 
 
-def _capsule_1(size: Size) -> Shape:
+def _capsule_1(size: Size) -> TriangleMesh:
     return _capped(size("radiusBottom", 0.5), size("radiusTop", 0.5), size("height", 1.0))
 
 
-def _cube(size: Size) -> Shape:
+def _cube(size: Size) -> TriangleMesh:
     half = 0.5 * size("size", 2.0)
     if half == 0.0:
         return _faceted(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -91,7 +91,7 @@ def _cube(size: Size) -> Shape:
     return _faceted(points, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3))
 
 
-def _plane(size: Size) -> Shape:
+def _plane(size: Size) -> TriangleMesh:
     x, y = 0.5 * size("width", 2.0), 0.5 * size("length", 2.0)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     if x == 0.0 or y == 0.0:
@@ -99,7 +99,7 @@ def _plane(size: Size) -> Shape:
     return _faceted(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-IMPLICIT: dict[str, Callable[[Size], Shape]] = {
+IMPLICIT: dict[str, Callable[[Size], TriangleMesh]] = {
     "Sphere": _sphere,
     "Cube": _cube,
     "Cylinder": _cylinder,
@@ -109,11 +109,11 @@ IMPLICIT: dict[str, Callable[[Size], Shape]] = {
     "Capsule_1": _capsule_1,
     "Plane": _plane,
 }
-"""The schemas this module reads."""
+"""The implicit schemas that are read, and how each is tessellated."""
 
 
-def _frustum(bottom: float, top: float, height: float) -> Shape:
-    """A cylinder or cone with both ends closed, centred on the origin."""
+def _frustum(bottom: float, top: float, height: float) -> TriangleMesh:
+    """A closed cylinder, cone or cone frustum, centred on the origin."""
     low, high = -0.5 * height, 0.5 * height
     slant = math.hypot(height, bottom - top) or 1.0
     side = [height / slant, (bottom - top) / slant]
@@ -126,8 +126,8 @@ def _frustum(bottom: float, top: float, height: float) -> Shape:
     )
 
 
-def _capped(bottom: float, top: float, height: float) -> Shape:
-    """A cone frustum whose spherical caps continue it without a crease."""
+def _capped(bottom: float, top: float, height: float) -> TriangleMesh:
+    """A cone frustum with spherical caps, tangent-continuous (a capsule)."""
     slope = math.degrees(math.atan2(bottom - top, height)) if height > 0.0 else 0.0
     tangent, cosine = math.tan(math.radians(slope)), math.cos(math.radians(slope))
     low = _arc(bottom / cosine, -0.5 * height - bottom * tangent, -90.0, slope)
@@ -136,7 +136,7 @@ def _capped(bottom: float, top: float, height: float) -> Shape:
 
 
 def _arc(radius: float, center: float, start: float, stop: float) -> Floats:
-    """Profile of a spherical zone from latitude `start` to `stop` [degrees], as fine as the lathe."""
+    """Profile of a spherical zone from latitude `start` to `stop` [degrees], in steps of 360° / `_SEGMENTS`."""
     steps = max(2, math.ceil((stop - start) / 360.0 * _SEGMENTS))
     latitude = np.radians(np.linspace(start, stop, steps + 1))
     normal = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
@@ -144,44 +144,44 @@ def _arc(radius: float, center: float, start: float, stop: float) -> Floats:
     return np.concatenate([radius * normal + [0.0, center], normal], axis=1)
 
 
-def _lathe(profile: Profile) -> Shape:
-    """A surface of revolution about Z, without the triangles that collapse on the axis or on each other."""
+def _lathe(profile: Profile) -> TriangleMesh:
+    """A surface of revolution about Z, without degenerate triangles (on the axis, or between equal profile points)."""
     angle = 2.0 * math.pi * np.arange(_SEGMENTS) / _SEGMENTS
     rows = np.concatenate(list(profile))
     ends = np.cumsum([len(arc) for arc in profile])
     below = np.setdiff1d(np.arange(len(rows) - 1), ends[:-1] - 1)
     i, j = np.arange(_SEGMENTS), (np.arange(_SEGMENTS) + 1) % _SEGMENTS
     ring = below[:, None] * _SEGMENTS
-    lower = np.stack([ring + i, ring + j, ring + _SEGMENTS + j], axis=-1)  # two corners on the lower ring
+    lower = np.stack([ring + i, ring + j, ring + _SEGMENTS + j], axis=-1)  # two vertices on the lower ring
     upper = np.stack([ring + i, ring + _SEGMENTS + j, ring + _SEGMENTS + i], axis=-1)
     r, z = rows[:, 0], rows[:, 1]
-    apart = (np.diff(r)[below] != 0.0) | (np.diff(z)[below] != 0.0)
-    keep = np.stack([(r[below] > 0.0) & apart, (r[below + 1] > 0.0) & apart], axis=1)
+    distinct = (np.diff(r)[below] != 0.0) | (np.diff(z)[below] != 0.0)
+    keep = np.stack([(r[below] > 0.0) & distinct, (r[below + 1] > 0.0) & distinct], axis=1)
     triangles = np.stack([lower, upper], axis=1)[keep].reshape(-1, 3)
 
-    def turned(radial: Floats, axial: Floats, at: Floats) -> Floats:
+    def revolve(radial: Floats, axial: Floats, at: Floats) -> Floats:
         return np.stack([radial * np.cos(at), radial * np.sin(at), np.broadcast_to(axial, at.shape)], axis=-1)
 
-    points = turned(r[:, None], z[:, None], np.broadcast_to(angle, (len(rows), _SEGMENTS))).reshape(-1, 3)
+    points = revolve(r[:, None], z[:, None], np.broadcast_to(angle, (len(rows), _SEGMENTS))).reshape(-1, 3)
     row, column = np.divmod(triangles, _SEGMENTS)
     at = angle[column]
-    # On the axis every direction meets: the triangle's own middle decides.
+    # On the axis the azimuth is undefined: the normal takes that of the triangle's middle.
     middle = angle[column[:, :1]] + math.pi / _SEGMENTS
     at = np.where(r[row] > 0.0, at, middle)
-    normals = turned(rows[row, 2], rows[row, 3], at).astype(np.float32)
+    normals = revolve(rows[row, 2], rows[row, 3], at).astype(np.float32)
     shape = _faceted(points, triangles)
-    return Shape(shape.points, shape.triangles, shape.face, shape.corner, normals)
+    return TriangleMesh(shape.points, shape.triangles, shape.face, shape.corner, normals)
 
 
-def _inside_out(shape: Shape) -> Shape:
-    """The shape with its front inside: what emits shines inwards."""
+def _reversed(shape: TriangleMesh) -> TriangleMesh:
+    """The shape with reversed winding and normals, so that its front is inside."""
     normals = None if shape.normals is None else -shape.normals[:, ::-1]
     return replace(shape, triangles=shape.triangles[:, ::-1], corner=shape.corner[:, ::-1], normals=normals)
 
 
-def _faceted(points: Floats, triangles: Floats) -> Shape:
+def _faceted(points: Floats, triangles: Ints) -> TriangleMesh:
     count = len(triangles)
-    return Shape(
+    return TriangleMesh(
         points=points,
         triangles=triangles.astype(np.int32).reshape(-1, 3),
         face=np.arange(count, dtype=np.int32),

@@ -1,9 +1,9 @@
-"""Which prototypes are stored once, and which are written out wherever they are: memory decides.
+"""Whether a prototype is stored once or flattened into world space; memory decides.
 
-What is small is written out, for rays through one tree are the fastest: prototypes that are in one place, and the
-others, those that make fewest triangles first, as long as they make no more than `MOST_WRITTEN` together. Within a
-prototype that is itself in many places, instances are written out if triangles of `_TRIANGLE` bytes then take less
-memory than places of `_PLACE` bytes. All others are stored once.
+Rays through a single BVH are fastest, so small prototypes are flattened: those with one instance, and the others in
+ascending order of their triangles in the world, up to `MAX_FLATTENED_TRIANGLES` in total. Within a prototype that has
+several instances itself, nested instances are flattened if their triangles, of `_TRIANGLE_BYTES` each, take less memory
+than instances of `_INSTANCE_BYTES` each. All other prototypes are stored once.
 """
 
 import hashlib
@@ -11,238 +11,244 @@ import math
 import os
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.scene import Floats, InputError
+from warp_ir.scene import Bools, Floats, InputError
 from warp_ir.scene.instances import cofactors
-from warp_ir.usd.geometry.instancing import Level, combined, combined_colors
-from warp_ir.usd.values.triangles import Mask
+from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 
-_TRIANGLE = 200
-_PLACE = 600
-MOST_WRITTEN = 2**20
-"""Most triangles that copies make together before prototypes are stored once."""
-_MOST_TRIANGLES = 200_000_000
-"""A scene of this size takes tens of gigabytes: refused before it is allocated."""
-_WORST = 1.0e6
-"""Condition number above which a matrix is no use for rays in single precision."""
+_TRIANGLE_BYTES = 200
+_INSTANCE_BYTES = 600
+MAX_FLATTENED_TRIANGLES = 2**20
+"""Maximum number of triangles that flattened instances have in total; beyond, prototypes are stored once."""
+_MAX_TRIANGLES = 200_000_000
+"""Maximum number of stored triangles: they take tens of gigabytes, so a scene with more is refused beforehand."""
+_MAX_CONDITION = 1.0e6
+"""Condition number above which rays cannot be transformed by a matrix in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """A gprim below a level."""
+class InstancedGprim:
+    """A gprim and the instance level that contains it."""
 
-    level: Level
+    level: InstanceLevel
     triangles: int
+    """Number of triangles."""
     signature: Hashable
-    """Equal for parts that look the same in levels of the same key."""
-    alone: bool
-    """Whether it has to be written out, since every place of it emits."""
+    """Equal for gprims of the same geometry and materials, in levels of the same key."""
+    emissive: bool
+    """Whether it emits; then it is always flattened, since each of its instances is an emitter of its own."""
 
 
 @dataclass(eq=False)
-class Group:
-    """Levels that hold the same, in the same parent, as one: a prototype in all its places there."""
+class LevelGroup:
+    """Levels with equal contents and the same parent, merged: a prototype with all its instances in the parent."""
 
-    parent: "Group | None"
-    levels: list[Level]
-    parts: list[int]
-    """Of the first of the levels, which stands for all."""
-    children: "list[Group]" = field(default_factory=list)
-    written: bool = False
-    """Whether its places are written out in the parent."""
-    shared: bool = False
-    """Whether it is stored once."""
+    parent: "LevelGroup | None"
+    levels: list[InstanceLevel]
+    gprims: list[int]
+    """Indices of the gprims in the first of the levels, which represents all."""
+    children: "list[LevelGroup]" = field(default_factory=list)
+    flattened: bool = False
+    """Whether its instances are flattened into the parent."""
+    stored_once: bool = False
+    """Whether it is stored as a prototype."""
 
     @property
-    def places(self) -> int:
-        """In the parent."""
+    def instance_count(self) -> int:
+        """Number of instances in the parent."""
         return sum(len(level.matrices) for level in self.levels)
 
     @property
-    def total(self) -> int:
-        """Places in the world."""
-        return self.places * (1 if self.parent is None else self.parent.total)
+    def world_count(self) -> int:
+        """Number of instances in the world."""
+        return self.instance_count * (1 if self.parent is None else self.parent.world_count)
 
-    def chain(self) -> "list[Group]":
-        """From the world to this group."""
+    def chain(self) -> "list[LevelGroup]":
+        """The groups from the world down to this one."""
         groups = [self]
         while groups[-1].parent is not None:
             groups.append(groups[-1].parent)
         return groups[::-1]
 
-    def matrices(self) -> Floats:
-        """world_from_prototype, float64 [total, 4, 4]."""
-        return combined(np.concatenate([level.matrices for level in group.levels]) for group in self.chain())
+    def world_matrices(self) -> Floats:
+        """world_from_prototype of every instance, float64 [world_count, 4, 4]."""
+        return nested_transforms(np.concatenate([level.matrices for level in group.levels]) for group in self.chain())
 
-    def colors(self) -> Floats | None:
-        """Colour (displayColor) of every place in the world, float64 [total, 3]; None: it has none."""
-        return combined_colors((group.places, _together(group.levels)) for group in self.chain())
+    def world_colors(self) -> Floats | None:
+        """DisplayColor of every instance in the world, float64 [world_count, 3], or None."""
+        return nested_colors((group.instance_count, _level_colors(group.levels)) for group in self.chain())
 
 
-def _together(levels: Sequence[Level]) -> Floats | None:
-    given = [level.colors for level in levels if level.colors is not None]
-    return np.concatenate(given) if given else None
+def _level_colors(levels: Sequence[InstanceLevel]) -> Floats | None:
+    """Colours of the instances of levels, one after the other; all levels of a group have colours, or none has."""
+    colors = [level.colors for level in levels if level.colors is not None]
+    return np.concatenate(colors) if colors else None
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """A part as a mesh that is stored: in the world, or in a prototype."""
+class StoredMesh:
+    """A mesh to store for a gprim: in world space or in the space of a prototype."""
 
-    part: int
-    group: Group | None
-    """The prototype; None: the world."""
-    levels: tuple[Level, ...]
-    """Whose places are written out, outermost first."""
+    gprim: int
+    """Index of the gprim."""
+    prototype: LevelGroup | None
+    """The prototype that the mesh is part of; None: the mesh is in world space."""
+    levels: tuple[InstanceLevel, ...]
+    """Levels whose instances are flattened into the mesh, outermost first."""
 
 
-def share(parts: Sequence[Part], source: str) -> list[Drawn]:
-    """Decides for every part where it is stored.
+def choose_storage(gprims: Sequence[InstancedGprim], source: str) -> list[StoredMesh]:
+    """Decides for every gprim whether its instances are flattened or its prototype is stored once.
 
     Args:
-        parts: In the order of the stage; each is drawn once at least, except in levels that another stands for.
-        source: The file, named in errors.
+        gprims: In the order of the stage.
+        source: Path of the file, named in errors.
+
+    Returns:
+        The meshes to store: one for each gprim, except for those in levels that another level represents.
 
     Raises:
-        InputError: However it is stored, it is too much.
+        InputError: The scene has too many triangles or instances, even with prototypes stored once.
     """
-    tree = _Tree(parts)
+    tree = _LevelTree(gprims)
     tree.decide()
-    drawn, triangles, places = [], 0, {}
-    for k, part in enumerate(parts):
-        home, level = (None, None) if part.alone else tree.home(part.level)
-        if home is None or level is None:
-            levels = tuple(part.level.chain()[1:])
-        elif level is home.levels[0]:
-            places[id(home)] = home.total
-            levels = tuple(part.level.chain()[len(level.chain()) :])
+    meshes, triangles, instances = [], 0, {}
+    for k, gprim in enumerate(gprims):
+        prototype, level = (None, None) if gprim.emissive else tree.storage_of(gprim.level)
+        if prototype is None or level is None:
+            levels = tuple(gprim.level.chain()[1:])
+        elif level is prototype.levels[0]:
+            instances[id(prototype)] = prototype.world_count
+            levels = tuple(gprim.level.chain()[len(level.chain()) :])
         else:
             continue
-        triangles += part.triangles * math.prod(len(level.matrices) for level in levels)
-        drawn.append(Drawn(k, home, levels))
-    if triangles > _MOST_TRIANGLES:
+        triangles += gprim.triangles * math.prod(len(level.matrices) for level in levels)
+        meshes.append(StoredMesh(k, prototype, levels))
+    if triangles > _MAX_TRIANGLES:
         raise InputError(f"{source}: {triangles} triangles after instancing: too many to load")
-    needed, there = _PLACE * sum(places.values()), _memory()
-    if needed > there:
+    count = sum(instances.values())
+    needed, available = _INSTANCE_BYTES * count, _physical_memory()
+    if needed > available:
         raise InputError(
-            f"{source}: {sum(places.values())} instances, too many: they need about {needed / 2**30:.0f} GiB,"
-            f" there are {there / 2**30:.0f}"
+            f"{source}: {count} instances are too many: they need about {needed / 2**30:.0f} GiB of memory, the machine"
+            f" has {available / 2**30:.0f} GiB"
         )
-    return drawn
+    return meshes
 
 
-class _Tree:
-    """The levels that parts are in, those that hold the same as one `Group`."""
+class _LevelTree:
+    """The tree of instance levels; levels with equal contents are one `LevelGroup`."""
 
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self._parts = parts
-        self._own: dict[int, list[int]] = {}
-        self._below: dict[int, list[Level]] = {}
-        self._levels: dict[int, Level] = {}
-        for k, part in enumerate(parts):
-            self._own.setdefault(id(part.level), []).append(k)
-            for level in reversed(part.level.chain()):
+    def __init__(self, gprims: Sequence[InstancedGprim]) -> None:
+        self._gprims = gprims
+        self._gprims_in: dict[int, list[int]] = {}
+        self._children_of: dict[int, list[InstanceLevel]] = {}
+        self._levels: dict[int, InstanceLevel] = {}
+        for k, gprim in enumerate(gprims):
+            self._gprims_in.setdefault(id(gprim.level), []).append(k)
+            for level in reversed(gprim.level.chain()):
                 if id(level) in self._levels:
                     break
                 self._levels[id(level)] = level
                 if level.parent is not None:
-                    self._below.setdefault(id(level.parent), []).append(level)
+                    self._children_of.setdefault(id(level.parent), []).append(level)
         self._signatures: dict[int, Hashable] = {}
-        self._group: dict[int, Group] = {}
-        self._groups: list[Group] = []
+        self._group_of: dict[int, LevelGroup] = {}
+        self._groups: list[LevelGroup] = []
         for level in self._levels.values():
             if level.parent is None:
-                self._gather(self._collect(None, [level]))
+                self._add(self._grouped(None, [level]))
 
-    def home(self, level: Level) -> tuple[Group, Level] | tuple[None, None]:
-        """The prototype in which what is in a level is stored, and the level that it is there; None: the world."""
-        group = self._group[id(level)]
-        while group.written:
+    def storage_of(self, level: InstanceLevel) -> tuple[LevelGroup, InstanceLevel] | tuple[None, None]:
+        """The prototype that stores the contents of a level, and the level of that prototype; None: the world."""
+        group = self._group_of[id(level)]
+        while group.flattened:
             assert group.parent is not None and level.parent is not None
             group, level = group.parent, level.parent
-        return (group, level) if group.shared else (None, None)
+        return (group, level) if group.stored_once else (None, None)
 
     def decide(self) -> None:
-        """Chooses what is written out and what is shared."""
+        """Chooses which groups are flattened and which are stored once."""
         sizes: dict[int, int] = {}
         for group in reversed(self._groups):  # children before their parents
-            size = sum(self._parts[k].triangles for k in group.parts if not self._parts[k].alone)
-            size += sum(child.places * sizes[id(child)] for child in group.children if child.written)
+            size = sum(self._gprims[k].triangles for k in group.gprims if not self._gprims[k].emissive)
+            size += sum(child.instance_count * sizes[id(child)] for child in group.children if child.flattened)
             sizes[id(group)] = size
-            if group.parent is not None and group.parent.total > 1:
-                apart = _TRIANGLE * size + _PLACE * group.total
-                group.written = _TRIANGLE * size * group.places <= apart
-        left = [g for g in self._groups if not g.written and g.total > 1 and sizes[id(g)]]
-        sum_written = 0
-        for group in sorted(left, key=lambda g: g.total * sizes[id(g)]):
-            sum_written += group.total * sizes[id(group)]
-            group.shared = sum_written > MOST_WRITTEN
+            if group.parent is not None and group.parent.world_count > 1:
+                stored_once = _TRIANGLE_BYTES * size + _INSTANCE_BYTES * group.world_count
+                group.flattened = _TRIANGLE_BYTES * size * group.instance_count <= stored_once
+        candidates = [g for g in self._groups if not g.flattened and g.world_count > 1 and sizes[id(g)]]
+        flattened_triangles = 0
+        for group in sorted(candidates, key=lambda g: g.world_count * sizes[id(g)]):
+            flattened_triangles += group.world_count * sizes[id(group)]
+            group.stored_once = flattened_triangles > MAX_FLATTENED_TRIANGLES
 
-    def _collect(self, parent: Group | None, siblings: Sequence[Level]) -> list[Group]:
-        """Siblings as groups of those that hold the same."""
-        by_key: dict[Hashable, list[Level]] = {}
+    def _grouped(self, parent: LevelGroup | None, siblings: Sequence[InstanceLevel]) -> list[LevelGroup]:
+        """Sibling levels, grouped by equal contents."""
+        by_key: dict[Hashable, list[InstanceLevel]] = {}
         for level in siblings:
             by_key.setdefault((level.key, level.colors is None), []).append(level)
         groups = []
         for levels in by_key.values():
-            alike: dict[Hashable, list[Level]] = {}
+            by_signature: dict[Hashable, list[InstanceLevel]] = {}
             for level in levels:
-                alike.setdefault(self._signature(level) if len(levels) > 1 else None, []).append(level)
-            groups += [Group(parent, same, self._own.get(id(same[0]), [])) for same in alike.values()]
+                by_signature.setdefault(self._signature(level) if len(levels) > 1 else None, []).append(level)
+            groups += [LevelGroup(parent, same, self._gprims_in.get(id(same[0]), [])) for same in by_signature.values()]
         return groups
 
-    def _gather(self, groups: list[Group]) -> None:
-        """Enters groups and all that is below them."""
+    def _add(self, groups: list[LevelGroup]) -> None:
+        """Adds groups and all groups below them to the tree."""
         for group in groups:
             self._groups.append(group)
-            self._group.update((id(level), group) for level in group.levels)
-            group.children = self._collect(group, self._below.get(id(group.levels[0]), []))
-            self._gather(group.children)
-            # What is below the other levels is the same in the same order.
+            self._group_of.update((id(level), group) for level in group.levels)
+            group.children = self._grouped(group, self._children_of.get(id(group.levels[0]), []))
+            self._add(group.children)
+            # The other levels of the group have equal descendants in the same order.
             for other in group.levels[1:]:
-                self._follow(group.levels[0], other)
+                self._assign_descendants(group.levels[0], other)
 
-    def _follow(self, first: Level, other: Level) -> None:
-        pairs = zip(self._below.get(id(first), []), self._below.get(id(other), []), strict=True)
-        for below_first, below_other in pairs:
-            self._group[id(below_other)] = self._group[id(below_first)]
-            self._follow(below_first, below_other)
+    def _assign_descendants(self, first: InstanceLevel, other: InstanceLevel) -> None:
+        """Assigns the descendants of a level to the groups of the equal descendants of the first level."""
+        pairs = zip(self._children_of.get(id(first), []), self._children_of.get(id(other), []), strict=True)
+        for child_of_first, child_of_other in pairs:
+            self._group_of[id(child_of_other)] = self._group_of[id(child_of_first)]
+            self._assign_descendants(child_of_first, child_of_other)
 
-    def _signature(self, level: Level) -> Hashable:
-        """What a level holds, apart from its own places."""
+    def _signature(self, level: InstanceLevel) -> Hashable:
+        """A key that is equal for levels of equal contents, whatever the transforms of their own instances."""
         if id(level) not in self._signatures:
-            own = (self._parts[k] for k in self._own.get(id(level), []))
-            below = (
+            gprims = (self._gprims[k] for k in self._gprims_in.get(id(level), []))
+            children = (
                 (child.key, self._signature(child), digest(child.matrices), digest(child.colors))
-                for child in self._below.get(id(level), [])
+                for child in self._children_of.get(id(level), [])
             )
             self._signatures[id(level)] = (
-                tuple((part.signature, part.alone) for part in own),
-                tuple(below),
+                tuple((gprim.signature, gprim.emissive) for gprim in gprims),
+                tuple(children),
             )
         return self._signatures[id(level)]
 
 
-def digest(array: npt.NDArray[Any] | None) -> bytes | None:
-    """Equal for equal arrays."""
+def digest(array: npt.NDArray[np.generic] | None) -> bytes | None:
+    """Hash of an array's bytes; None of None."""
     return None if array is None else hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
 
 
-def fit_for_rays(matrices: Floats) -> Mask:
-    """Which matrices [k, 4, 4] can be inverted without losing the precision that rays need."""
+def well_conditioned(matrices: Floats) -> Bools:
+    """Mask [k] of the matrices [k, 4, 4] whose inverse is precise enough to transform rays (`_MAX_CONDITION`)."""
     with np.errstate(all="ignore"):
         linear = matrices[:, :3, :3]
         cofactor = cofactors(linear)
         determinant = np.sum(linear[:, 0] * cofactor[:, 0], axis=1)
         condition = np.abs(linear).max(axis=(1, 2)) * np.abs(cofactor).max(axis=(1, 2)) / np.abs(determinant)
-        return np.asarray(condition < _WORST)
+        return np.asarray(condition < _MAX_CONDITION)
 
 
-def _memory() -> float:
-    """Bytes that this machine has; infinity if unknown."""
+def _physical_memory() -> float:
+    """Memory of this machine in bytes; infinity if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):

@@ -1,9 +1,9 @@
 """Subdivision surfaces: uniform refinement by Catmull-Clark, Loop or bilinear rules, of points and of primvars alike.
 
-One level turns a face of c vertices into c quadrilaterals (Loop: a triangle into four). Every new value is a weighted
-mean of old ones around a face, an edge or a vertex; the weights depend on the topology and the sharpness alone, so
-they are found once and applied to whatever lives on the mesh. Rules as in OpenSubdiv: Catmull and Clark 1978, Loop
-1987, semi-sharp creases of DeRose, Kass and Truong 1998, seams of face-varying values as boundaries.
+One level splits a face of c vertices into c quadrilaterals (Loop: a triangle into four). Every refined value is a
+weighted mean of values around a face, an edge or a vertex. The weights depend only on topology and sharpness, so they
+are computed once and applied to points and primvars. Rules as in OpenSubdiv: Catmull and Clark 1978, Loop 1987,
+semi-sharp creases of DeRose, Kass and Truong 1998, seams of face-varying values as boundaries.
 """
 
 from dataclasses import dataclass, replace
@@ -11,17 +11,16 @@ from enum import Enum
 
 import numpy as np
 
-from warp_ir.scene import Floats, Ints
-from warp_ir.usd.values.triangles import Mask
+from warp_ir.scene import Bools, Floats, Ints
 
 INFINITE = 10.0
-"""Sharpness from which on an edge or a vertex stays sharp at every level (OpenSubdiv's constant)."""
+"""Sharpness from which an edge or a vertex stays sharp at every level (OpenSubdiv's constant)."""
 _SMOOTH_TRIANGLE = 0.47
-"""Weight of a triangle's middle in an edge's point under triangleSubdivisionRule "smooth"; 1/4 otherwise."""
+"""Weight of a triangle's face point in an edge point with triangleSubdivisionRule "smooth"; else 1/4."""
 
 
 class Scheme(Enum):
-    """How a mesh is refined; the values are UsdGeom's tokens."""
+    """Subdivision schemes; the values are UsdGeom's tokens."""
 
     CATMULL_CLARK = "catmullClark"
     LOOP = "loop"
@@ -30,19 +29,19 @@ class Scheme(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Cage:
-    """The mesh to refine.
+    """The control cage: the mesh to refine.
 
-    Faces with less than three vertices must not occur; Loop takes triangles alone.
+    Every face has at least three vertices; Loop subdivision needs triangles.
     """
 
     counts: Ints
-    """int64 [f]: vertices per face."""
+    """int64 [f], vertices per face."""
     indices: Ints
-    """int64 [v]: point of each face-vertex, all in [0, points)."""
+    """int64 [v], point of each face-vertex, in [0, points)."""
     points: int
-    """How many points there are."""
+    """Number of points."""
     edges: Ints
-    """int64 [c, 2]: pairs of points whose edge is a crease."""
+    """int64 [c, 2], pairs of points whose edge is a crease."""
     edge_sharpness: Floats
     """float64 [c], in [0, INFINITE]."""
     point_sharpness: Floats
@@ -52,12 +51,12 @@ class Cage:
     smooth_triangles: bool = False
     """Whether triangleSubdivisionRule is "smooth"."""
     face: Ints | None = None
-    """int64 [f]: the prim's face each face is, or is part of; None: the same."""
+    """int64 [f], the prim's face that each face is or is part of; None: the same indices."""
     corner: Ints | None = None
-    """int64 [v]: the prim's face-vertex each face-vertex is; None: the same."""
+    """int64 [v], the prim's face-vertex of each face-vertex; None: the same indices."""
 
     def with_sharp_corners(self) -> "Cage":
-        """This cage with points that have a single face infinitely sharp (interpolateBoundary "edgeAndCorner")."""
+        """This cage with points of a single face made infinitely sharp (interpolateBoundary "edgeAndCorner")."""
         single = np.bincount(self.indices, minlength=self.points) == 1
         return replace(self, point_sharpness=np.where(single, INFINITE, self.point_sharpness))
 
@@ -66,51 +65,51 @@ class Refinement:
     """A cage refined a number of times.
 
     Args:
-        cage: What to refine.
-        scheme: By which rules.
-        levels: How often, at least once.
+        cage: The control cage.
+        scheme: The subdivision scheme.
+        levels: Number of refinements, at least 1.
         linear: UsdGeom's faceVaryingLinearInterpolation, for `face_varying`.
 
     Attributes:
-        face: int64 [f']: the prim's face each refined face is part of.
-        indices: int64 [f', 4], or [f', 3] for Loop: refined point of each refined face-vertex.
-        drawn: bool [f']: False where no surface is defined (at boundaries that are not interpolated).
+        face: int64 [f'], the prim's face that each refined face is part of.
+        indices: int64 [f', 4], or [f', 3] for Loop, refined point of each refined face-vertex.
+        has_surface: bool [f'], False where no surface is defined (next to boundaries that are not interpolated).
     """
 
     def __init__(self, cage: Cage, scheme: Scheme, levels: int, linear: str = "cornersPlus1") -> None:
         self._cage, self._scheme, self._linear = cage, scheme, linear
-        self._steps: list[_Step] = []
+        self._steps: list[_SubdivisionStep] = []
         parent: Ints = np.arange(len(cage.counts))
-        mesh = self._base = _Mesh.of(cage)
+        mesh = self._base = _Topology.from_cage(cage)
         for _ in range(levels):
-            step = _Step(mesh, scheme)
+            step = _SubdivisionStep(mesh, scheme)
             self._steps.append(step)
             parent = parent[step.parent]
             mesh = step.child
         self._finest = mesh
-        self.drawn: Mask = self._base.has_surface()[parent]
+        self.has_surface: Bools = self._base.faces_with_surface()[parent]
         self.face: Ints = parent if cage.face is None else cage.face[parent]
         self.indices: Ints = mesh.indices.reshape(len(mesh.counts), -1)
 
     def vertex(self, values: Floats) -> Floats:
-        """Values [points, c] on the smooth surface, float64 [points', c]."""
+        """Values [points, c] at the refined points by the rules of the scheme, float64 [points', c]."""
         for step in self._steps:
             values = step.smooth(values)
         return values
 
     def varying(self, values: Floats) -> Floats:
-        """Values [points, c] interpolated linearly over every face of the cage, float64 [points', c]."""
+        """Values [points, c] at the refined points, linear over every face of the cage, float64 [points', c]."""
         for step in self._steps:
             values = step.linear(values)
         return values
 
     def face_varying(self, values: Floats, indices: Ints | None = None) -> Floats:
-        """Values of the prim's face-vertices at the refined ones, float64 [f' k, c].
+        """Values of the prim's face-vertices at the refined face-vertices, float64 [f' k, c].
 
         Args:
             values: [v, c], or [n, c] with indices.
-            indices: int [v] into the values: face-vertices of a point that share an index belong together, others
-                have a seam between them. Without indices every face stands alone.
+            indices: int [v] into the values. Face-vertices of a point with different indices are divided by a seam;
+                without indices, every face is interpolated separately.
         """
         if self._cage.corner is not None:
             values = values[self._cage.corner] if indices is None else values
@@ -120,29 +119,33 @@ class Refinement:
             for step in self._steps:
                 values = step.corners(values)
             return values
-        seams, first = self._seams(indices)
-        refined = Refinement(seams, self._scheme, len(self._steps))
+        cut, first = self._cut_along_seams(indices)
+        refined = Refinement(cut, self._scheme, len(self._steps))
         return refined.vertex(values[indices[first]])[refined.indices.reshape(-1)]
 
     def normals(self, points: Floats) -> Floats:
-        """Unit normals of the refined face-vertices, float64 [f' k, 3]: smooth, but not across what is still sharp.
+        """Unit normals at the refined face-vertices, float64 [f' k, 3], smooth except across sharp refined edges.
 
-        A corner's share is the cross product of its two edges: area counts, and slivers do not.
+        A normal is the sum over corners of the cross products of their two edges, so that it is weighted by area.
 
         Args:
             points: Refined points, float64 [points', 3].
         """
         corners = points[self.indices]
-        side = np.roll(corners, -1, axis=1) - corners
-        (x, y, z), (u, v, w) = np.moveaxis(side, 2, 0), np.moveaxis(-np.roll(side, 1, axis=1), 2, 0)
+        edge = np.roll(corners, -1, axis=1) - corners
+        (x, y, z), (u, v, w) = np.moveaxis(edge, 2, 0), np.moveaxis(-np.roll(edge, 1, axis=1), 2, 0)
         group = self._finest.smooth_groups()
-        shares = (y * w - z * v, z * u - x * w, x * v - y * u)
-        total = np.stack([np.bincount(group, weights=share.reshape(-1)) for share in shares], axis=1)
+        products = (y * w - z * v, z * u - x * w, x * v - y * u)
+        total = np.stack([np.bincount(group, weights=product.reshape(-1)) for product in products], axis=1)
         length = np.sqrt(np.einsum("ni,ni->n", total, total))[:, None]
         return (total / np.where(length > 0.0, length, 1.0))[group]
 
-    def _seams(self, indices: Ints) -> tuple[Cage, Ints]:
-        """The cage cut along its seams: its points are the pairs of a point and a value; and a face-vertex of each."""
+    def _cut_along_seams(self, indices: Ints) -> tuple[Cage, Ints]:
+        """The cage cut along the seams of face-varying values.
+
+        Returns:
+            The cage, whose points are the distinct pairs of a point and a value index; and a face-vertex of each.
+        """
         cage, base = self._cage, self._base
         pairs = cage.indices * (int(indices.max(initial=0)) + 1) + indices
         _, first, split = np.unique(pairs, return_index=True, return_inverse=True)
@@ -151,56 +154,69 @@ class Refinement:
         faces = np.bincount(split, minlength=count)
         siblings = np.bincount(point, minlength=cage.points)[point]
         sharp = cage.point_sharpness[point]
-        ring = np.stack([split, split[base.next]], axis=1)
-        cut = Cage(cage.counts, split, count, ring, base.sharpness[base.edge], sharp)
+        edges = np.stack([split, split[base.next]], axis=1)
+        cut = Cage(cage.counts, split, count, edges, base.sharpness[base.edge], sharp)
         if self._linear != "none":
             sharp = np.where(faces == 1, INFINITE, sharp)
         if self._linear in ("cornersPlus1", "cornersPlus2"):
             sharp = np.where(siblings > 2, INFINITE, sharp)
         if self._linear in ("cornersPlus2", "boundaries"):
-            mesh = _Mesh.of(cut)
-            rim = np.zeros(count, dtype=bool)
-            rim[mesh.ends[mesh.faces == 1].reshape(-1)] = True
+            mesh = _Topology.from_cage(cut)
+            boundary = np.zeros(count, dtype=bool)
+            boundary[mesh.ends[mesh.face_counts == 1].reshape(-1)] = True
             if self._linear == "boundaries":
-                sharp = np.where(rim, INFINITE, sharp)
-            else:  # a concave corner beside a convex one, and the end of a seam
+                sharp = np.where(boundary, INFINITE, sharp)
+            else:  # concave corners opposite to convex ones, and darts: the ends of a seam
                 corner = np.bincount(point, weights=faces == 1, minlength=cage.points)[point] > 0
-                whole = np.zeros(cage.points, dtype=bool)
-                whole[base.ends[base.faces == 1].reshape(-1)] = True
-                sharp = np.where((siblings == 2) & corner | (siblings == 1) & rim & ~whole[point], INFINITE, sharp)
+                mesh_boundary = np.zeros(cage.points, dtype=bool)
+                mesh_boundary[base.ends[base.face_counts == 1].reshape(-1)] = True
+                dart = (siblings == 1) & boundary & ~mesh_boundary[point]
+                sharp = np.where((siblings == 2) & corner | dart, INFINITE, sharp)
         return replace(cut, point_sharpness=sharp, smooth_triangles=cage.smooth_triangles), first
 
 
-class _Mesh:
-    """Faces with their edges and what is sharp.
+class _Topology:
+    """Faces, edges and points of a mesh, and their sharpness.
 
     Attributes:
-        counts: int64 [f], vertices per face; `indices` [v], their points, of which there are `points`.
-        face: int64 [v], face of each face-vertex; `next` and `before` [v], its neighbours in that face.
+        counts: int64 [f], vertices per face.
+        indices: int64 [v], point of each face-vertex.
+        points: Number of points.
+        face: int64 [v], face of each face-vertex.
+        next: int64 [v], the next face-vertex of the same face; `previous` [v], the one before.
         edge: int64 [v], the edge from each face-vertex to the next.
-        ends: int64 [e, 2], the points of an edge; `faces` [e], how many faces it has.
-        sharpness: float64 [e] of the edges, [points] `point_sharpness` of the points.
+        ends: int64 [e, 2], the two points of each edge.
+        face_counts: int64 [e], number of faces at each edge.
+        sharpness: float64 [e], sharpness of the edges.
+        point_sharpness: float64 [points], sharpness of the points.
     """
 
     def __init__(
-        self, cage: Cage, counts: Ints, indices: Ints, edge: Ints, ends: Ints, sharpness: Floats, corners: Floats
+        self,
+        cage: Cage,
+        counts: Ints,
+        indices: Ints,
+        edge: Ints,
+        ends: Ints,
+        sharpness: Floats,
+        point_sharpness: Floats,
     ) -> None:
-        self.cage, self.counts, self.indices, self.points = cage, counts, indices, len(corners)
-        self.edge, self.ends, self.point_sharpness = edge, ends, corners
+        self.cage, self.counts, self.indices, self.points = cage, counts, indices, len(point_sharpness)
+        self.edge, self.ends, self.point_sharpness = edge, ends, point_sharpness
         offsets = np.cumsum(counts) - counts
         self.face: Ints = np.repeat(np.arange(len(counts)), counts)
         self.next: Ints = np.arange(1, len(indices) + 1)
         self.next[offsets + counts - 1] = offsets
-        self.before: Ints = np.arange(-1, len(indices) - 1)
-        self.before[offsets] = offsets + counts - 1
-        self.faces: Ints = np.bincount(edge, minlength=len(ends))
-        # Where more than two faces meet no smooth surface exists.
-        infinite = (self.faces > 2) | ((self.faces == 1) & cage.sharp_boundary)
+        self.previous: Ints = np.arange(-1, len(indices) - 1)
+        self.previous[offsets] = offsets + counts - 1
+        self.face_counts: Ints = np.bincount(edge, minlength=len(ends))
+        # Non-manifold edges have no smooth surface.
+        infinite = (self.face_counts > 2) | ((self.face_counts == 1) & cage.sharp_boundary)
         self.sharpness: Floats = np.where(infinite, INFINITE, sharpness)
 
     @staticmethod
-    def of(cage: Cage) -> "_Mesh":
-        """The cage itself."""
+    def from_cage(cage: Cage) -> "_Topology":
+        """The topology of a cage, with its creases."""
         following = np.arange(1, len(cage.indices) + 1)
         ends = np.cumsum(cage.counts)
         following[ends - 1] = ends - cage.counts
@@ -213,35 +229,35 @@ class _Mesh:
         sharpness = np.zeros(len(keys))
         if len(cage.edges):
             crease = key(cage.edges[:, 0], cage.edges[:, 1])
-            place = np.searchsorted(keys, crease).clip(max=len(keys) - 1)
-            known = keys[place] == crease  # what is no edge cannot be sharp
-            np.maximum.at(sharpness, place[known], cage.edge_sharpness[known])
+            index = np.searchsorted(keys, crease).clip(max=len(keys) - 1)
+            is_edge = keys[index] == crease  # creases between points without an edge are ignored
+            np.maximum.at(sharpness, index[is_edge], cage.edge_sharpness[is_edge])
         pairs = np.stack(np.divmod(keys, cage.points), axis=1)
-        return _Mesh(cage, cage.counts, cage.indices, edge, pairs, sharpness, cage.point_sharpness)
+        return _Topology(cage, cage.counts, cage.indices, edge, pairs, sharpness, cage.point_sharpness)
 
-    def has_surface(self) -> Mask:
-        """Which faces [f] do not touch an edge of the boundary that is left open."""
-        open_edges = self.ends[(self.faces == 1) & (self.sharpness < INFINITE)].reshape(-1)
-        loose = np.zeros(self.points, dtype=bool)
-        loose[open_edges] = True
-        touching = np.bincount(self.face, weights=loose[self.indices], minlength=len(self.counts))
-        return np.asarray(touching == 0)
+    def faces_with_surface(self) -> Bools:
+        """Mask [f] of the faces without a point on a boundary edge that is not interpolated."""
+        open_ends = self.ends[(self.face_counts == 1) & (self.sharpness < INFINITE)].reshape(-1)
+        is_open = np.zeros(self.points, dtype=bool)
+        is_open[open_ends] = True
+        open_points = np.bincount(self.face, weights=is_open[self.indices], minlength=len(self.counts))
+        return np.asarray(open_points == 0)
 
     def smooth_groups(self) -> Ints:
-        """A number for each face-vertex [v]; those of a point that no sharp edge divides have the same."""
+        """Smoothing groups: a number per face-vertex [v], equal for those of a point that no sharp edge divides."""
         points, sharp = self.indices, self.sharpness > 0.0
         divided = np.zeros(self.points, dtype=bool)
         divided[self.ends[sharp].reshape(-1)] = True
-        loose = np.flatnonzero(divided[points])
-        if len(loose) == 0:
+        at_divided = np.flatnonzero(divided[points])
+        if len(at_divided) == 0:
             return points
-        # Only there the corners are joined one by one, over every edge with two faces that is not sharp.
-        near = np.flatnonzero(divided[self.ends].any(axis=1) & (self.faces == 2) & ~sharp)
-        wanted = np.zeros(len(self.ends), dtype=bool)
-        wanted[near] = True
-        around = np.flatnonzero(wanted[self.edge])
+        # At divided points only, corners are joined pairwise across every smooth edge with two faces.
+        smooth_edges = np.flatnonzero(divided[self.ends].any(axis=1) & (self.face_counts == 2) & ~sharp)
+        is_smooth = np.zeros(len(self.ends), dtype=bool)
+        is_smooth[smooth_edges] = True
+        around = np.flatnonzero(is_smooth[self.edge])
         one, two = around[np.argsort(self.edge[around], kind="stable")].reshape(-1, 2).T
-        alike = points[one] == points[two]  # two faces wound against each other run along their edge the same way
+        alike = points[one] == points[two]  # faces of opposite winding traverse their edge in the same direction
         links = np.concatenate(
             [
                 np.stack([one, np.where(alike, two, self.next[two])], axis=1),
@@ -250,7 +266,7 @@ class _Mesh:
         )
         links = links[divided[points[links[:, 0]]]]
         label = np.arange(len(points))
-        while True:  # each round joins every group with a neighbour: there are few
+        while True:  # connected components by label propagation; a few rounds suffice
             old = label[links]
             low = old.min(axis=1)
             merged = label.copy()
@@ -261,59 +277,61 @@ class _Mesh:
                 break
             label = merged
         group = points.copy()
-        group[loose] = self.points + label[loose]
+        group[at_divided] = self.points + label[at_divided]
         return group
 
 
-class _Step:
-    """One level of refinement: the refined mesh, and how values get there.
+class _SubdivisionStep:
+    """One level of refinement: the refined topology, and the interpolation of values.
 
-    The refined points are the old points, then one per edge, then (not with Loop) one per face.
+    The refined points are the vertex points, then an edge point per edge, then (not with Loop) a face point per face.
     """
 
-    def __init__(self, mesh: _Mesh, scheme: Scheme) -> None:
+    def __init__(self, mesh: _Topology, scheme: Scheme) -> None:
         self._mesh, self._loop = mesh, scheme is Scheme.LOOP
-        softer, rounder = _softened(mesh.sharpness), _softened(mesh.point_sharpness)
+        edge_sharpness, point_sharpness = _child_sharpness(mesh.sharpness), _child_sharpness(mesh.point_sharpness)
         self._entries: tuple[Ints, Ints, Floats, int] | None = None
         if scheme is not Scheme.BILINEAR:
-            self._entries = self._smooth_entries(*_point_weights(mesh, softer, rounder))
+            self._entries = self._smooth_entries(*_vertex_weights(mesh, edge_sharpness, point_sharpness))
         edges, corners = len(mesh.ends), len(mesh.indices)
-        middle = mesh.points + np.arange(edges)
-        point, ahead, behind = mesh.indices, mesh.edge, mesh.edge[mesh.before]
-        # Edges are cut in halves, numbered by which end they keep; behind them come those inside of the faces.
-        halves = np.stack([mesh.ends, np.stack([middle, middle], axis=1)], axis=2).reshape(-1, 2)
-        out, back = 2 * ahead + (mesh.ends[ahead, 0] != point), 2 * behind + (mesh.ends[behind, 0] != point)
-        inside = 2 * edges + np.arange(corners)
+        edge_point = mesh.points + np.arange(edges)
+        point, next_edge, previous_edge = mesh.indices, mesh.edge, mesh.edge[mesh.previous]
+        # Child edges are numbered: the two halves of every edge, in the order of its ends, then those inside of faces.
+        halves = np.stack([mesh.ends, np.stack([edge_point, edge_point], axis=1)], axis=2).reshape(-1, 2)
+        next_half = 2 * next_edge + (mesh.ends[next_edge, 0] != point)
+        previous_half = 2 * previous_edge + (mesh.ends[previous_edge, 0] != point)
+        interior = 2 * edges + np.arange(corners)
         if self._loop:
-            # Three triangles at the corners, each cut off by an inner edge, and the one in the middle.
-            triples = [x.reshape(-1, 3) for x in (point, mesh.points + ahead, mesh.points + behind)]
+            # Three child triangles at the corners, each bounded by an interior edge, and one in the middle.
+            triples = [x.reshape(-1, 3) for x in (point, mesh.points + next_edge, mesh.points + previous_edge)]
             corner = np.stack(triples, axis=2).reshape(-1, 9)
             faces = np.concatenate([corner, triples[1]], axis=1).reshape(-1, 3)
-            cut = inside.reshape(-1, 3)
-            rim = np.stack([out.reshape(-1, 3), cut, back.reshape(-1, 3)], axis=2).reshape(-1, 9)
-            edge = np.concatenate([rim, np.roll(cut, -1, axis=1)], axis=1).reshape(-1)
-            inner = np.stack([mesh.points + ahead, mesh.points + behind], axis=1)
+            inner = interior.reshape(-1, 3)
+            at_corners = [next_half.reshape(-1, 3), inner, previous_half.reshape(-1, 3)]
+            outer = np.stack(at_corners, axis=2).reshape(-1, 9)
+            edge = np.concatenate([outer, np.roll(inner, -1, axis=1)], axis=1).reshape(-1)
+            interior_ends = np.stack([mesh.points + next_edge, mesh.points + previous_edge], axis=1)
             self.parent: Ints = np.repeat(np.arange(len(mesh.counts)), 4)
             total = mesh.points + edges
         else:
-            center = mesh.points + edges + mesh.face
-            faces = np.stack([point, mesh.points + ahead, center, mesh.points + behind], axis=1)
-            edge = np.stack([out, inside, inside[mesh.before], back], axis=1).reshape(-1)
-            inner = np.stack([mesh.points + ahead, center], axis=1)
+            face_point = mesh.points + edges + mesh.face
+            faces = np.stack([point, mesh.points + next_edge, face_point, mesh.points + previous_edge], axis=1)
+            edge = np.stack([next_half, interior, interior[mesh.previous], previous_half], axis=1).reshape(-1)
+            interior_ends = np.stack([mesh.points + next_edge, face_point], axis=1)
             self.parent = mesh.face
             total = mesh.points + edges + len(mesh.counts)
-        self.child = _Mesh(
+        self.child = _Topology(
             mesh.cage,
             np.full(len(faces), faces.shape[1]),
             faces.reshape(-1),
             edge,
-            np.concatenate([halves, inner]),
-            np.concatenate([np.repeat(softer, 2), np.zeros(corners)]),
-            np.concatenate([rounder, np.zeros(total - mesh.points)]),
+            np.concatenate([halves, interior_ends]),
+            np.concatenate([np.repeat(edge_sharpness, 2), np.zeros(corners)]),
+            np.concatenate([point_sharpness, np.zeros(total - mesh.points)]),
         )
 
     def smooth(self, values: Floats) -> Floats:
-        """Values at the points [n, c] after this step, by the rules of the scheme."""
+        """Values of points [n, c] at the refined points, by the rules of the scheme."""
         if self._entries is None:
             return self.linear(values)
         rows, columns, weights, edges = self._entries
@@ -321,29 +339,29 @@ class _Step:
         source = values if faces is None else np.concatenate([values, faces])
         count = len(values) + edges
         sums = [np.bincount(rows, weights * source[columns, k], minlength=count) for k in range(values.shape[1])]
-        new = np.stack(sums, axis=1).astype(np.float64, copy=False)
-        return new if faces is None else np.concatenate([new, faces])
+        refined = np.stack(sums, axis=1).astype(np.float64, copy=False)
+        return refined if faces is None else np.concatenate([refined, faces])
 
     def linear(self, values: Floats) -> Floats:
-        """Values at the points [n, c] after this step, each face on its own."""
-        middles = 0.5 * (values[self._mesh.ends[:, 0]] + values[self._mesh.ends[:, 1]])
+        """Values of points [n, c] at the refined points, linear over every face."""
+        edge_means = 0.5 * (values[self._mesh.ends[:, 0]] + values[self._mesh.ends[:, 1]])
         if self._loop:
-            return np.concatenate([values, middles])
-        return np.concatenate([values, middles, self._face_means(values[self._mesh.indices])])
+            return np.concatenate([values, edge_means])
+        return np.concatenate([values, edge_means, self._face_means(values[self._mesh.indices])])
 
     def corners(self, values: Floats) -> Floats:
-        """Values at the face-vertices [v, c] after this step, each face on its own."""
-        ahead = 0.5 * (values + values[self._mesh.next])
-        behind = ahead[self._mesh.before]
+        """Values of face-vertices [v, c] at the refined face-vertices, linear over every face."""
+        next_mean = 0.5 * (values + values[self._mesh.next])
+        previous_mean = next_mean[self._mesh.previous]
         columns = values.shape[1]
         if self._loop:
-            corner = np.stack([values, ahead, behind], axis=1).reshape(-1, 9, columns)
-            return np.concatenate([corner, ahead.reshape(-1, 3, columns)], axis=1).reshape(-1, columns)
-        center = self._face_means(values)[self._mesh.face]
-        return np.stack([values, ahead, center, behind], axis=1).reshape(-1, columns)
+            corner = np.stack([values, next_mean, previous_mean], axis=1).reshape(-1, 9, columns)
+            return np.concatenate([corner, next_mean.reshape(-1, 3, columns)], axis=1).reshape(-1, columns)
+        face_mean = self._face_means(values)[self._mesh.face]
+        return np.stack([values, next_mean, face_mean, previous_mean], axis=1).reshape(-1, columns)
 
     def _face_means(self, values: Floats) -> Floats:
-        """Mean of each face's values, from those of its face-vertices [v, c]: [f, c]."""
+        """Mean over each face of the values of its face-vertices [v, c], [f, c]."""
         counts = self._mesh.counts
         if len(counts) and (counts == counts[0]).all():
             mean: Floats = values.reshape(len(counts), int(counts[0]), -1).mean(axis=1)
@@ -353,12 +371,15 @@ class _Step:
         return means
 
     def _smooth_entries(self, smooth: Floats, own: Floats, along: Floats) -> tuple[Ints, Ints, Floats, int]:
-        """The matrix from [points, faces] to [points, edges] as rows, columns and weights; and the number of edges.
+        """The sparse matrix from points and face points to vertex points and edge points.
 
         Args:
-            smooth: How much of the smooth rule each point follows, [n].
-            own: Weight of a point for itself by the other rules, [n].
-            along: Weight of the far end of an edge by the other rules, for both ends of each edge, [e, 2].
+            smooth: Fraction of the smooth vertex rule at each point, [n].
+            own: Weight of a point in its own vertex point by the crease and corner rules, [n].
+            along: Weights by the crease rule of the opposite end of each edge, for both of its ends, [e, 2].
+
+        Returns:
+            Rows, columns and weights of the entries, and the number of edges.
         """
         mesh = self._mesh
         edges, index = len(mesh.ends), np.arange(mesh.points)
@@ -373,68 +394,76 @@ class _Step:
         rows = [index, mesh.ends[:, 0], mesh.ends[:, 1]]
         columns = [index, mesh.ends[:, 1], mesh.ends[:, 0]]
         weights = [own + smooth * near, *(along + (smooth * far)[mesh.ends]).T]
-        row, crease = mesh.points + np.arange(edges), np.where(mesh.faces == 2, np.minimum(mesh.sharpness, 1.0), 1.0)
+        row, crease = (
+            mesh.points + np.arange(edges),
+            np.where(mesh.face_counts == 2, np.minimum(mesh.sharpness, 1.0), 1.0),
+        )
         if self._loop:
-            third = mesh.indices[mesh.before]
+            opposite_point = mesh.indices[mesh.previous]
             opposite = 0.125 * (1.0 - crease)[mesh.edge]
             end = 0.375 * (1.0 - crease) + 0.5 * crease
             rows += [row, row, mesh.points + mesh.edge]
-            columns += [mesh.ends[:, 0], mesh.ends[:, 1], third]
+            columns += [mesh.ends[:, 0], mesh.ends[:, 1], opposite_point]
             weights += [end, end, opposite]
         else:
             triangle = (mesh.counts == 3) & mesh.cage.smooth_triangles
-            middle = np.where(triangle, _SMOOTH_TRIANGLE, 0.25)[mesh.face]
-            both = 0.5 * np.bincount(mesh.edge, middle, minlength=edges)
-            end = (1.0 - crease) * (0.5 - both) + 0.5 * crease
+            face_weight = np.where(triangle, _SMOOTH_TRIANGLE, 0.25)[mesh.face]
+            mean_weight = 0.5 * np.bincount(mesh.edge, face_weight, minlength=edges)
+            end = (1.0 - crease) * (0.5 - mean_weight) + 0.5 * crease
             rows += [mesh.indices, row, row, mesh.points + mesh.edge]
             columns += [mesh.points + mesh.face, mesh.ends[:, 0], mesh.ends[:, 1], mesh.points + mesh.face]
             weights += [
                 (smooth / (valence * faces))[mesh.indices],
                 end,
                 end,
-                ((1.0 - crease) * both)[mesh.edge],
+                ((1.0 - crease) * mean_weight)[mesh.edge],
             ]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), edges
 
 
-def _point_weights(mesh: _Mesh, softer: Floats, rounder: Floats) -> tuple[Floats, Floats, Floats]:
-    """How points move: the share of the smooth rule [n], their own weight [n] and their edges' [e, 2] by the others.
+def _vertex_weights(
+    mesh: _Topology, child_edge_sharpness: Floats, child_point_sharpness: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Weights of the vertex rules (smooth, crease, corner) at each point.
 
-    A point follows the rule that its sharpness asks for before this level; where an edge or the point itself loses its
-    sharpness at this level, that and the rule after it are mixed by the fraction of the sharpness that was left.
+    A point follows the rule of its sharpness before this level. Where an edge or the point itself loses its sharpness
+    at this level, the rules of parent and child are blended by the remaining fractional sharpness.
 
     Args:
         mesh: The topology.
-        softer: Sharpness of the edges after this level.
-        rounder: Sharpness of the points after this level.
+        child_edge_sharpness: Sharpness of the edges after this level.
+        child_point_sharpness: Sharpness of the points after this level.
+
+    Returns:
+        `smooth`, `own` and `along`, the arguments of `_SubdivisionStep._smooth_entries`.
     """
     ends, n = mesh.ends, mesh.points
 
-    def around(per_edge: Floats | Mask) -> Floats:
+    def around(per_edge: Floats | Bools) -> Floats:
         doubled = np.repeat(np.asarray(per_edge, dtype=np.float64), 2)
         return np.asarray(np.bincount(ends.reshape(-1), doubled, minlength=n))
 
-    before, after = mesh.sharpness > 0.0, softer > 0.0
+    before, after = mesh.sharpness > 0.0, child_edge_sharpness > 0.0
     sharp_before, sharp_after = around(before), around(after)
-    alone = np.bincount(mesh.indices, minlength=n) == 0
-    corner_before = (mesh.point_sharpness > 0.0) | (sharp_before > 2) | alone
-    corner_after = (rounder > 0.0) | (sharp_after > 2) | alone
+    isolated = np.bincount(mesh.indices, minlength=n) == 0
+    corner_before = (mesh.point_sharpness > 0.0) | (sharp_before > 2) | isolated
+    corner_after = (child_point_sharpness > 0.0) | (sharp_after > 2) | isolated
     crease_before = ~corner_before & (sharp_before == 2)
     crease_after = ~corner_after & (sharp_after == 2)
-    ends_here = (mesh.point_sharpness > 0.0) & (rounder == 0.0)
-    fading = before & ~after
-    fades = around(fading) + ends_here
-    left = around(np.where(fading, mesh.sharpness, 0.0)) + np.where(ends_here, mesh.point_sharpness, 0.0)
-    mixed = (corner_before & ~corner_after) | (crease_before & ~crease_after & ~corner_after)
-    share = np.where(mixed & (fades > 0.0), np.minimum(left / np.maximum(fades, 1.0), 1.0), 1.0)
-    crease_0, crease_1 = share * crease_before, (1.0 - share) * crease_after
-    corner = share * corner_before + (1.0 - share) * corner_after
+    point_fades = (mesh.point_sharpness > 0.0) & (child_point_sharpness == 0.0)
+    edge_fades = before & ~after
+    fading = around(edge_fades) + point_fades
+    remaining = around(np.where(edge_fades, mesh.sharpness, 0.0)) + np.where(point_fades, mesh.point_sharpness, 0.0)
+    blended = (corner_before & ~corner_after) | (crease_before & ~crease_after & ~corner_after)
+    fraction = np.where(blended & (fading > 0.0), np.minimum(remaining / np.maximum(fading, 1.0), 1.0), 1.0)
+    crease_0, crease_1 = fraction * crease_before, (1.0 - fraction) * crease_after
+    corner = fraction * corner_before + (1.0 - fraction) * corner_after
     smooth = 1.0 - crease_0 - crease_1 - corner
     along = 0.125 * (crease_0[ends] * before[:, None] + crease_1[ends] * after[:, None])
     return smooth, corner + 0.75 * (crease_0 + crease_1), along
 
 
-def _softened(sharpness: Floats) -> Floats:
-    """What one level leaves of a sharpness."""
-    left: Floats = np.where(sharpness >= INFINITE, INFINITE, np.maximum(sharpness - 1.0, 0.0))
-    return left
+def _child_sharpness(sharpness: Floats) -> Floats:
+    """Sharpness after one level: one less, at least 0; infinite sharpness remains."""
+    child: Floats = np.where(sharpness >= INFINITE, INFINITE, np.maximum(sharpness - 1.0, 0.0))
+    return child

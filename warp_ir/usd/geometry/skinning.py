@@ -1,7 +1,7 @@
-"""UsdSkel: meshes deformed by blend shapes and skeletons at the moment that is rendered.
+"""UsdSkel: meshes deformed by blend shapes and skeletons at the time that is rendered.
 
-The stage is only asked (`BakeSkinning` would write to it, and skips instances). USD resolves skeletons, animations and
-blend shape weights; what a file can get wrong (indices, lengths) is checked here before it is used.
+The stage is not modified (`BakeSkinning` would write to it, and skips instances). USD resolves skeletons, animations
+and blend shape weights; indices and array lengths, which files get wrong, are validated here before use.
 """
 
 from dataclasses import dataclass
@@ -12,59 +12,63 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from warp_ir.scene import Floats, Ints
 from warp_ir.usd.values.report import Report, Unreadable
 
-_DRAWN = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+_RENDERED = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
-    """A mesh as its skeleton and its blend shapes deform it, in the mesh's own space."""
+class DeformedMesh:
+    """A mesh deformed by its blend shapes and its skeleton, in the mesh's own space."""
 
     points: Floats
     """float64 [n, 3]."""
-    added: Floats | None
-    """What blend shapes add to the normal of each point, float64 [n, 3]."""
-    turned: Floats | None
-    """How the skeleton turns normals: rows times matrices, float64 [n, 3, 3]."""
+    normal_offsets: Floats | None
+    """Sum of the blend shapes' normal offsets at each point, float64 [n, 3]; None: no offsets."""
+    normal_matrices: Floats | None
+    """Transforms of each point's normal, a row vector, by the skeleton, float64 [n, 3, 3]; None: no skeleton."""
 
     def normals(self, normals: Floats, triangles: Ints) -> Floats:
-        """The deformed normals of the corners [m, 3, 3] at the points that the triangles [m, 3] name."""
-        if self.added is not None:
-            normals = normals + self.added[triangles]
-        return normals if self.turned is None else np.einsum("mci,mcij->mcj", normals, self.turned[triangles])
+        """Deformed normals [m, 3, 3] at the corners of the triangles [m, 3]."""
+        if self.normal_offsets is not None:
+            normals = normals + self.normal_offsets[triangles]
+        if self.normal_matrices is None:
+            return normals
+        deformed: Floats = np.einsum("mci,mcij->mcj", normals, self.normal_matrices[triangles])
+        return deformed
 
 
 def is_bound(prim: Usd.Prim) -> bool:
-    """Whether a prim may be deformed."""
+    """Whether a prim has SkelBindingAPI applied."""
     return bool(prim.HasAPI(UsdSkel.BindingAPI))
 
 
-def sharing_key(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
-    """What tells the poses of a prototype's prim apart: where in the prototype its skeleton and its animation are.
+def pose_key(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
+    """A key that is equal for instances of a prototype's prim with the same pose.
 
-    If they are elsewhere, every instance has a pose of its own.
+    It holds the paths of skeleton and animation if both are in the prototype. If they are outside of it, every instance
+    can have a pose of its own, and the key is its path.
     """
     if not is_bound(prim) or not prim.IsInstanceProxy():
         return ()
     skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
     if not skeleton:
         return ()
-    home = prim.GetPrimInPrototype().GetPath().GetPrefixes()[0]
+    prototype = prim.GetPrimInPrototype().GetPath().GetPrefixes()[0]
     key = []
     for source in (skeleton.GetPrim(), UsdSkel.BindingAPI(skeleton.GetPrim()).GetInheritedAnimationSource()):
         if source:
-            shared = source.GetPrimInPrototype().GetPath() if source.IsInstanceProxy() else source.GetPath()
-            if not shared.HasPrefix(home):
+            path = source.GetPrimInPrototype().GetPath() if source.IsInstanceProxy() else source.GetPath()
+            if not path.HasPrefix(prototype):
                 return (prim.GetPath(),)
-            key.append(shared)
+            key.append(path)
     return tuple(key)
 
 
 class Skinning:
-    """The poses of a stage's meshes.
+    """Deforms the meshes of a stage by UsdSkel.
 
     Args:
-        time: Of the poses.
-        report: Where troubles go.
+        time: Time at which animation is evaluated.
+        report: Receives warnings.
     """
 
     def __init__(self, time: Usd.TimeCode, report: Report) -> None:
@@ -73,41 +77,41 @@ class Skinning:
         self._roots: set[Sdf.Path] = set()
         self._transforms = UsdGeom.XformCache(time)
 
-    def pose(self, prim: Usd.Prim, points: Floats) -> Pose | None:
-        """The deformed mesh; None if nothing deforms it, or if that cannot be evaluated: then it keeps its rest pose.
+    def deform(self, prim: Usd.Prim, points: Floats) -> DeformedMesh | None:
+        """The deformed mesh; None if nothing deforms it or, with a warning, if its deformation cannot be evaluated.
 
         Args:
             prim: A mesh.
-            points: Its points at rest, float64 [n, 3].
+            points: Its points in the rest pose, float64 [n, 3].
         """
         if not is_bound(prim):
             return None
         try:
-            return self._pose(prim, points)
-        except Unreadable as trouble:
-            self._report.warn(prim.GetPath(), f"{trouble}; the mesh is in its rest pose ({{n}} in all)")
+            return self._deform(prim, points)
+        except Unreadable as error:
+            self._report.warn(prim.GetPath(), f"{error}; the mesh is in its rest pose ({{n}} in all)")
             return None
 
-    def _pose(self, prim: Usd.Prim, points: Floats) -> Pose | None:
-        query = self._query(prim)
+    def _deform(self, prim: Usd.Prim, points: Floats) -> DeformedMesh | None:
+        query = self._skinning_query(prim)
         if query is None or not (query.HasJointInfluences() or query.HasBlendShapes()):
             return None
         assert self._cache is not None
         skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
         if not skeleton:
             raise Unreadable("it is bound to no skeleton")
-        bones = self._cache.GetSkelQuery(skeleton)
-        if not bones:
+        skeleton_query = self._cache.GetSkelQuery(skeleton)
+        if not skeleton_query:
             raise Unreadable(f"its skeleton {skeleton.GetPath()} is not valid")
-        added = None
+        offsets = None
         if query.HasBlendShapes():
-            points, added = self._blended(prim, query, bones, points)
+            points, offsets = self._apply_blend_shapes(prim, query, skeleton_query, points)
         if not query.HasJointInfluences():
-            return Pose(points, added, None)
-        return self._skinned(prim, query, bones, points, added)
+            return DeformedMesh(points, offsets, None)
+        return self._apply_skeleton(prim, query, skeleton_query, points, offsets)
 
-    def _query(self, prim: Usd.Prim) -> UsdSkel.SkinningQuery | None:
-        """What USD knows about the prim's binding; None if it is not below a SkelRoot, where nothing is deformed."""
+    def _skinning_query(self, prim: Usd.Prim) -> UsdSkel.SkinningQuery | None:
+        """USD's query for a prim's binding; None if the prim is not below a SkelRoot and so is not deformed."""
         root = UsdSkel.Root.Find(prim)
         if not root:
             return None
@@ -115,15 +119,15 @@ class Skinning:
             self._cache = UsdSkel.Cache()
         if root.GetPath() not in self._roots:
             self._roots.add(root.GetPath())
-            self._cache.Populate(root, _DRAWN)
+            self._cache.Populate(root, _RENDERED)
         query = self._cache.GetSkinningQuery(prim)
         return query if query else None
 
-    def _blended(
-        self, prim: Usd.Prim, query: UsdSkel.SkinningQuery, bones: UsdSkel.SkeletonQuery, points: Floats
+    def _apply_blend_shapes(
+        self, prim: Usd.Prim, query: UsdSkel.SkinningQuery, skeleton: UsdSkel.SkeletonQuery, points: Floats
     ) -> tuple[Floats, Floats | None]:
-        """The points with their blend shapes, and what those add to the normals."""
-        animation = bones.GetAnimQuery()
+        """The points with weighted offsets of their blend shapes, and the sum of the normal offsets."""
+        animation = skeleton.GetAnimQuery()
         weights = animation.ComputeBlendShapeWeights(self._time) if animation else None
         if not weights:
             return points, None
@@ -137,42 +141,42 @@ class Skinning:
             raise Unreadable(f"there are {len(weights)} weights for {shapes.GetNumBlendShapes()} blend shapes")
         active = shapes.ComputeSubShapeWeights(weights)
         offsets, indices = shapes.ComputeSubShapePointOffsets(), shapes.ComputeBlendShapePointIndices()
-        points, added = points.copy(), np.zeros_like(points)
+        points, normal_offsets = points.copy(), np.zeros_like(points)
         for weight, shape, subshape in zip(*(np.asarray(a).tolist() for a in active), strict=True):
-            where = np.asarray(indices[shape], dtype=np.int64)
-            between, whole = shapes.GetInbetween(subshape), shapes.GetBlendShape(shape)
-            if not whole:
+            authored = np.asarray(indices[shape], dtype=np.int64)
+            inbetween, blend_shape = shapes.GetInbetween(subshape), shapes.GetBlendShape(shape)
+            if not blend_shape:
                 raise Unreadable(f"blend shape {shape} does not exist")
-            normals = between.GetNormalOffsets() if between else whole.GetNormalOffsetsAttr().Get()
-            for target, given in ((points, offsets[subshape]), (added, normals)):
-                offset = np.asarray(given if given is not None else [], dtype=np.float64).reshape(-1, 3)
+            normals = inbetween.GetNormalOffsets() if inbetween else blend_shape.GetNormalOffsetsAttr().Get()
+            for target, values in ((points, offsets[subshape]), (normal_offsets, normals)):
+                offset = np.asarray(values if values is not None else [], dtype=np.float64).reshape(-1, 3)
                 if len(offset) == 0:
                     continue
-                which = where if len(where) else np.arange(len(points))
-                if len(which) != len(offset) or which.min() < 0 or which.max() >= len(points):
+                index = authored if len(authored) else np.arange(len(points))
+                if len(index) != len(offset) or index.min() < 0 or index.max() >= len(points):
                     raise Unreadable(f"blend shape {shape} has {len(offset)} offsets that do not fit the points")
-                np.add.at(target, which, weight * offset)
-        return points, added if added.any() else None
+                np.add.at(target, index, weight * offset)
+        return points, normal_offsets if normal_offsets.any() else None
 
-    def _skinned(
+    def _apply_skeleton(
         self,
         prim: Usd.Prim,
         query: UsdSkel.SkinningQuery,
-        bones: UsdSkel.SkeletonQuery,
+        skeleton: UsdSkel.SkeletonQuery,
         points: Floats,
-        added: Floats | None,
-    ) -> Pose:
-        """The points as the skeleton moves them, by linear blending or with dual quaternions."""
-        binds = bones.GetSkeleton().GetBindTransformsAttr().Get()
-        if not isinstance(binds, Vt.Matrix4dArray) or len(binds) != len(bones.GetJointOrder()):
-            # USD itself would take what is not there.
-            raise Unreadable(f"its skeleton {bones.GetPrim().GetPath()} has not one bind transform for each joint")
-        joints = bones.ComputeSkinningTransforms(self._time)
+        normal_offsets: Floats | None,
+    ) -> DeformedMesh:
+        """The mesh deformed by its skeleton, by linear blend or dual quaternion skinning."""
+        binds = skeleton.GetSkeleton().GetBindTransformsAttr().Get()
+        if not isinstance(binds, Vt.Matrix4dArray) or len(binds) != len(skeleton.GetJointOrder()):
+            # USD does not check this and would read beyond the array.
+            raise Unreadable(f"its skeleton {skeleton.GetPrim().GetPath()} has not one bind transform for each joint")
+        joints = skeleton.ComputeSkinningTransforms(self._time)
         mapper = query.GetJointMapper()
         if joints and mapper is not None and not mapper.IsIdentity():
             joints = mapper.RemapTransforms(joints)
         if not joints or not np.isfinite(np.asarray(joints)).all():
-            raise Unreadable(f"its skeleton {bones.GetPrim().GetPath()} cannot be evaluated")
+            raise Unreadable(f"its skeleton {skeleton.GetPrim().GetPath()} cannot be evaluated")
         influences = query.ComputeVaryingJointInfluences(len(points), self._time)
         count = query.GetNumInfluencesPerComponent()
         if not influences or count < 1 or any(len(a) != count * len(points) for a in influences):
@@ -182,46 +186,48 @@ class Skinning:
             raise Unreadable(f"a joint index is out of range, there are {len(joints)} joints")
         if not np.isfinite(weight).all():
             raise Unreadable("a joint weight is NaN or infinite")
-        bind, back = query.GetGeomBindTransform(self._time), self._mesh_from_skeleton(prim)
-        if not (np.isfinite(np.asarray(bind)).all() and np.isfinite(np.asarray(back)).all()):
+        bind, mesh_from_skeleton = query.GetGeomBindTransform(self._time), self._mesh_from_skeleton(prim)
+        if not (np.isfinite(np.asarray(bind)).all() and np.isfinite(np.asarray(mesh_from_skeleton)).all()):
             raise Unreadable("its bind transform is NaN or infinite")
         if query.GetSkinningMethod() == UsdSkel.Tokens.dualQuaternion:
-            flat = [Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32))]
-            flat += [Vt.FloatArray.FromNumpy(weight.reshape(-1).astype(np.float32))]
-            moved, turned = _by_dual_quaternions(bind, joints, flat, count, points)
-            outer = np.asarray(back)
-            return Pose(moved @ outer[:3, :3] + outer[3, :3], added, turned @ _normal_matrices(outer[None, :3, :3]))
-        matrices = np.asarray(bind) @ np.asarray(joints) @ np.asarray(back)  # rows times matrices, from mesh to mesh
-        moved = np.zeros_like(points)
-        turned = np.zeros((len(points), 3, 3))
-        normal_matrices = _normal_matrices(matrices[:, :3, :3])
+            influence_arrays = [Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32))]
+            influence_arrays += [Vt.FloatArray.FromNumpy(weight.reshape(-1).astype(np.float32))]
+            skinned, normal_matrices = _skin_dual_quaternion(bind, joints, influence_arrays, count, points)
+            outer = np.asarray(mesh_from_skeleton)
+            normal_matrices = normal_matrices @ _inverse_transposes(outer[None, :3, :3])
+            return DeformedMesh(skinned @ outer[:3, :3] + outer[3, :3], normal_offsets, normal_matrices)
+        # For row vectors, from the mesh's space by way of the skeleton's back to the mesh's.
+        matrices = np.asarray(bind) @ np.asarray(joints) @ np.asarray(mesh_from_skeleton)
+        skinned = np.zeros_like(points)
+        normal_matrices = np.zeros((len(points), 3, 3))
+        inverse_transposes = _inverse_transposes(matrices[:, :3, :3])
         for k in range(count):
-            share, of = weight[:, k : k + 1].astype(np.float64), index[:, k]
-            moved += share * (np.einsum("ni,nij->nj", points, matrices[of, :3, :3]) + matrices[of, 3, :3])
-            turned += share[:, :, None] * normal_matrices[of]
-        return Pose(moved, added, turned)
+            w, joint = weight[:, k : k + 1].astype(np.float64), index[:, k]
+            skinned += w * (np.einsum("ni,nij->nj", points, matrices[joint, :3, :3]) + matrices[joint, 3, :3])
+            normal_matrices += w[:, :, None] * inverse_transposes[joint]
+        return DeformedMesh(skinned, normal_offsets, normal_matrices)
 
     def _mesh_from_skeleton(self, prim: Usd.Prim) -> Gf.Matrix4d:
-        """From the space of the skeleton, where it poses meshes, to that of the mesh."""
+        """The transform from the skeleton's space, in which meshes are skinned, to the mesh's."""
         mesh = self._transforms.GetLocalToWorldTransform(prim)
         if not abs(mesh.GetDeterminant()) > 0.0:
             raise Unreadable("its transform is singular")
-        # The query's own prim may be the prototype's, which is nowhere.
+        # The query's prim may be in a prototype, which has no transform to world space.
         skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton().GetPrim()
         return self._transforms.GetLocalToWorldTransform(skeleton) * mesh.GetInverse()
 
 
-def _by_dual_quaternions(
+def _skin_dual_quaternion(
     bind: Gf.Matrix4d,
     joints: Vt.Matrix4dArray,
     influences: list[Vt.IntArray | Vt.FloatArray],
     count: int,
     points: Floats,
 ) -> tuple[Floats, Floats]:
-    """Points [n, 3] in the skeleton's space, and the matrices [n, 3, 3] that turn their normals there."""
+    """Skinned points [n, 3] in the skeleton's space, and the matrices [n, 3, 3] of their normals (row vectors)."""
     method = UsdSkel.Tokens.dualQuaternion
-    moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
-    if not UsdSkel.SkinPoints(method, bind, joints, *influences, count, moved):
+    skinned = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
+    if not UsdSkel.SkinPoints(method, bind, joints, *influences, count, skinned):
         raise Unreadable("its dual quaternions cannot be evaluated")
     bind3 = bind.ExtractRotationMatrix().GetInverse().GetTranspose()
     joints3 = Vt.Matrix3dArray([j.ExtractRotationMatrix().GetInverse().GetTranspose() for j in joints])
@@ -231,13 +237,13 @@ def _by_dual_quaternions(
         if not UsdSkel.SkinNormals(method, bind3, joints3, *influences, count, row):
             raise Unreadable("its dual quaternions cannot be evaluated")
         rows.append(np.asarray(row, dtype=np.float64))
-    return np.asarray(moved, dtype=np.float64), np.stack(rows, axis=1)
+    return np.asarray(skinned, dtype=np.float64), np.stack(rows, axis=1)
 
 
-def _normal_matrices(matrices: Floats) -> Floats:
-    """The inverse transposes of matrices [k, 3, 3]; of flat ones the cofactors, which point the same way."""
+def _inverse_transposes(matrices: Floats) -> Floats:
+    """Inverse transposes of matrices [k, 3, 3]; cofactor matrices, which are proportional, of singular ones."""
     a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    volume = np.einsum("ki,ki->k", a, cofactors[:, 0])
-    scaled: Floats = cofactors / np.where(volume != 0.0, volume, 1.0)[:, None, None]
-    return scaled
+    cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    determinant = np.einsum("ki,ki->k", a, cofactor[:, 0])
+    result: Floats = cofactor / np.where(determinant != 0.0, determinant, 1.0)[:, None, None]
+    return result

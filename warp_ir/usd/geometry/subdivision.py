@@ -1,20 +1,20 @@
-"""Subdivision surfaces of UsdGeom: from a mesh's attributes to the cage that is refined, and on to triangles."""
+"""UsdGeom subdivision surfaces: a mesh's attributes to a control cage, its refinement, and triangles."""
 
 from dataclasses import replace
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from warp_ir.scene import Floats, InputError, Ints
+from warp_ir.scene import Bools, Floats, InputError, Ints
 from warp_ir.usd.geometry.refine import INFINITE, Cage, Refinement, Scheme
 from warp_ir.usd.geometry.triangulate import triangulate
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.triangles import Mask, Shape, elements_of, shaded, without_slivers
+from warp_ir.usd.values.triangles import TriangleMesh, count_elements, drop_degenerate, with_normals
 
-_MOST_REFINED = 20_000_000
-"""Triangles that subdivision may make in all: they take some ten gigabytes while they are made."""
-_LINEAR = ("none", "cornersOnly", "cornersPlus1", "cornersPlus2", "boundaries", "all")
+_MAX_REFINED_TRIANGLES = 20_000_000
+"""Maximum number of triangles that subdivision creates for all surfaces; they take some ten gigabytes meanwhile."""
+_FACE_VARYING_RULES = ("none", "cornersOnly", "cornersPlus1", "cornersPlus2", "boundaries", "all")
 
 
 def read_subdivided(
@@ -22,65 +22,65 @@ def read_subdivided(
     points: Floats,
     counts: Ints,
     indices: Ints,
-    finite: Mask,
-    keep: Mask,
+    finite: Bools,
+    keep: Bools,
     levels: int,
     time: Usd.TimeCode,
     report: Report,
-) -> Shape | None:
-    """The triangles of a subdivision surface; None if it has no faces. Authored normals do not count: it has its own.
+) -> TriangleMesh | None:
+    """The triangles of a subdivision surface; None if it has no faces. Authored normals are ignored, as in USD.
 
     Args:
         mesh: The prim, whose subdivisionScheme is one of `Scheme`.
-        points: Of the cage, float64 [n, 3], finite.
+        points: Points of the cage, float64 [n, 3], finite.
         counts: Vertices per face, int [f].
         indices: Point of each face-vertex, in range.
-        finite: Which faces [f] the surface is made of.
-        keep: Which of them are drawn: the others are holes.
-        levels: How often it is refined, at least once.
-        time: Of the values.
-        report: Where troubles go.
+        finite: Mask [f] of the faces that define the surface.
+        keep: Mask [f] of the faces that are rendered; the others are holes.
+        levels: Number of refinements, at least 1.
+        time: Time at which attributes are read.
+        report: Receives warnings and counts.
 
     Raises:
-        InputError: All surfaces together would make more triangles than can be held.
+        InputError: All surfaces together would have more than `_MAX_REFINED_TRIANGLES` triangles.
     """
     scheme = Scheme(read.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark"))
     cage = _cage(mesh, scheme, points, counts, indices, finite, time, report)
     if len(cage.counts) == 0:
         return None
-    made = (len(cage.counts) if scheme is Scheme.LOOP else len(cage.indices) // 2) * 4**levels
-    report.stats["triangles_refined"] += made
-    if report.stats["triangles_refined"] > _MOST_REFINED:
+    refined_triangles = (len(cage.counts) if scheme is Scheme.LOOP else len(cage.indices) // 2) * 4**levels
+    report.stats["triangles_refined"] += refined_triangles
+    if report.stats["triangles_refined"] > _MAX_REFINED_TRIANGLES:
         raise InputError(
             f"{report.source}: {mesh.GetPath()}: subdivision makes {report.stats['triangles_refined']} triangles, more "
-            f"than {_MOST_REFINED}: choose a lower complexity"
+            f"than {_MAX_REFINED_TRIANGLES}: choose a lower complexity"
         )
-    linear = read.text(mesh.GetFaceVaryingLinearInterpolationAttr(), time, "cornersPlus1")
-    refinement = Refinement(cage, scheme, levels, linear if linear in _LINEAR else "cornersPlus1")
-    vertices = refinement.indices.shape[1]
-    halves = np.array([[0, 1, 2], [0, 2, 3]] if vertices == 4 else [[0, 1, 2]])
-    drawn = np.flatnonzero(keep[refinement.face] & refinement.drawn)
-    corner = (drawn[:, None, None] * vertices + halves).reshape(-1, 3).astype(np.int32)
-    front = 1.0
+    rule = read.text(mesh.GetFaceVaryingLinearInterpolationAttr(), time, "cornersPlus1")
+    refinement = Refinement(cage, scheme, levels, rule if rule in _FACE_VARYING_RULES else "cornersPlus1")
+    face_size = refinement.indices.shape[1]
+    fan = np.array([[0, 1, 2], [0, 2, 3]] if face_size == 4 else [[0, 1, 2]])
+    rendered = np.flatnonzero(keep[refinement.face] & refinement.has_surface)
+    corner = (rendered[:, None, None] * face_size + fan).reshape(-1, 3).astype(np.int32)
+    orientation = 1.0
     if read.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
-        corner, front = corner[:, ::-1], -1.0
-    refined = refinement.vertex(points)
-    shape = Shape(
-        points=refined,
+        corner, orientation = corner[:, ::-1], -1.0
+    refined_points = refinement.vertex(points)
+    shape = TriangleMesh(
+        points=refined_points,
         triangles=refinement.indices.reshape(-1).astype(np.int32)[corner],
-        face=np.repeat(refinement.face[drawn], len(halves)).astype(np.int32),
+        face=np.repeat(refinement.face[rendered], len(fan)).astype(np.int32),
         corner=corner,
-        elements=elements_of(points, counts, indices),
-        refined=refinement,
+        element_counts=count_elements(points, counts, indices),
+        refiner=refinement,
     )
-    shape = without_slivers(shape)
+    shape = drop_degenerate(shape)
     lost = int(np.count_nonzero(keep)) - int(np.count_nonzero(np.bincount(shape.face)))
-    if not refinement.drawn.all():
-        lost = 0  # faces at an open boundary are missing on purpose
-    shape = replace(shape, degenerate=lost)
+    if not refinement.has_surface.all():
+        lost = 0  # with interpolateBoundary "none", faces at the boundary have no surface
+    shape = replace(shape, degenerate_faces=lost)
     if scheme is Scheme.BILINEAR or len(shape.triangles) == 0:
         return shape
-    return shaded(shape, front * refinement.normals(refined)[shape.corner])
+    return with_normals(shape, orientation * refinement.normals(refined_points)[shape.corner])
 
 
 def _cage(
@@ -89,19 +89,19 @@ def _cage(
     points: Floats,
     counts: Ints,
     indices: Ints,
-    present: Mask,
+    mask: Bools,
     time: Usd.TimeCode,
     report: Report,
 ) -> Cage:
-    """The mesh as its subdivision sees it: the faces present (holes too), its creases, corners and boundaries."""
-    present = present & (counts >= 3)
+    """The control cage of a mesh: its faces in the mask (holes included), creases, corners and boundary rule."""
+    mask = mask & (counts >= 3)
     if scheme is Scheme.LOOP:
-        if (counts[present] != 3).any():
-            report.warn(mesh.GetPath(), "Loop subdivision takes triangles: its other faces are cut into some first")
-        triangles, face = triangulate(points, counts, indices, present)
+        if (counts[mask] != 3).any():
+            report.warn(mesh.GetPath(), "Loop subdivision needs triangles: other faces are cut into triangles first")
+        triangles, face = triangulate(points, counts, indices, mask)
         corner, size = triangles.reshape(-1).astype(np.int64), np.full(len(face), 3)
     else:
-        face, corner, size = np.flatnonzero(present), np.flatnonzero(np.repeat(present, counts)), counts[present]
+        face, corner, size = np.flatnonzero(mask), np.flatnonzero(np.repeat(mask, counts)), counts[mask]
     edges, edge_sharpness = _creases(mesh, len(points), time, report)
     boundary = read.text(mesh.GetInterpolateBoundaryAttr(), time, "edgeAndCorner")
     cage = Cage(
@@ -120,32 +120,32 @@ def _cage(
 
 
 def _creases(mesh: UsdGeom.Mesh, points: int, time: Usd.TimeCode, report: Report) -> tuple[Ints, Floats]:
-    """The pairs of points [c, 2] along creases, and their sharpness [c]; none if the arrays do not fit together."""
-    none = np.zeros((0, 2), np.int64), np.zeros(0)
+    """Pairs of points [c, 2] along creases, and their sharpness [c]; empty, with a warning, if inconsistent."""
+    no_creases = np.zeros((0, 2), np.int64), np.zeros(0)
     try:
-        chain = read.ints(mesh.GetCreaseIndicesAttr(), time)
+        chains = read.ints(mesh.GetCreaseIndicesAttr(), time)
         lengths = read.ints(mesh.GetCreaseLengthsAttr(), time)
         sharpness = read.scalars(mesh.GetCreaseSharpnessesAttr(), time)
-        if chain is None or lengths is None or sharpness is None or len(lengths) == 0:
-            return none
-        if lengths.min() < 2 or lengths.sum() != len(chain):
-            raise Unreadable(f"creaseLengths do not divide the {len(chain)} creaseIndices into chains")
-        if len(sharpness) not in (len(lengths), len(chain) - len(lengths)):
+        if chains is None or lengths is None or sharpness is None or len(lengths) == 0:
+            return no_creases
+        if lengths.min() < 2 or lengths.sum() != len(chains):
+            raise Unreadable(f"creaseLengths do not divide the {len(chains)} creaseIndices into chains")
+        if len(sharpness) not in (len(lengths), len(chains) - len(lengths)):
             raise Unreadable(f"creaseSharpnesses has {len(sharpness)} values for {len(lengths)} creases")
-        read.check_range(chain, points, "creaseIndices")
-    except Unreadable as trouble:
-        report.warn(mesh.GetPath(), f"{trouble}; the creases are ignored")
-        return none
-    last = np.zeros(len(chain), dtype=bool)
+        read.check_range(chains, points, "creaseIndices")
+    except Unreadable as error:
+        report.warn(mesh.GetPath(), f"{error}; the creases are ignored")
+        return no_creases
+    last = np.zeros(len(chains), dtype=bool)
     last[np.cumsum(lengths) - 1] = True
     start = np.flatnonzero(~last)
     if len(sharpness) == len(lengths):
         sharpness = np.repeat(sharpness, lengths - 1)
-    return np.stack([chain[start], chain[start + 1]], axis=1), _sharpness(sharpness)
+    return np.stack([chains[start], chains[start + 1]], axis=1), _sharpness(sharpness)
 
 
 def _sharp_corners(mesh: UsdGeom.Mesh, points: int, time: Usd.TimeCode, report: Report) -> Floats:
-    """The sharpness of every point."""
+    """Sharpness of every point, float64 [points]; 0, with a warning, if the arrays are inconsistent."""
     sharp = np.zeros(points)
     try:
         corners = read.ints(mesh.GetCornerIndicesAttr(), time)
@@ -155,10 +155,11 @@ def _sharp_corners(mesh: UsdGeom.Mesh, points: int, time: Usd.TimeCode, report: 
                 raise Unreadable(f"cornerSharpnesses has {len(sharpness)} values for {len(corners)} cornerIndices")
             read.check_range(corners, points, "cornerIndices")
             sharp[corners] = _sharpness(sharpness)
-    except Unreadable as trouble:
-        report.warn(mesh.GetPath(), f"{trouble}; the corners are ignored")
+    except Unreadable as error:
+        report.warn(mesh.GetPath(), f"{error}; the corners are ignored")
     return sharp
 
 
 def _sharpness(values: Floats) -> Floats:
+    """Sharpness values clipped to [0, INFINITE]; NaN counts as 0."""
     return np.nan_to_num(values, nan=0.0).clip(0.0, INFINITE)

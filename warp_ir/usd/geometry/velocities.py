@@ -1,6 +1,7 @@
-"""What velocities carry from the time sample before a moment to the moment: points, positions, orientations.
+"""Extrapolation by authored velocities: points, positions and orientations between time samples.
 
-They make sense of a cache whose topology changes from sample to sample, where nothing can be interpolated.
+Where topology changes from sample to sample, values cannot be interpolated; velocities then give the motion after a
+sample (UsdGeomPointBased and UsdGeomPointInstancer).
 """
 
 import numpy as np
@@ -11,62 +12,71 @@ from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
 
-def carried_points(
+def extrapolated_points(
     attribute: Usd.Attribute,
     velocities: Usd.Attribute,
     accelerations: Usd.Attribute,
     time: Usd.TimeCode,
     report: Report,
 ) -> Floats | None:
-    """Points or positions [n, 3]: where velocities carry them from the sample before, else interpolated by USD."""
+    """Points or positions [n, 3] at a time: p + v t + a t² / 2 from the sample before, else interpolated by USD."""
     points = read.floats(attribute, time, 3)
-    seconds = _since_sample(attribute, velocities, time)
+    seconds = _seconds_since_sample(attribute, velocities, time)
     if points is None or seconds == 0.0:
         return points
-    sample = _bracket(attribute, time)
+    sample = _bracketing_samples(attribute, time)
     assert sample is not None
     try:
-        moved = read.floats(attribute, Usd.TimeCode(sample[0]), 3)
-        if moved is None:
+        start = read.floats(attribute, Usd.TimeCode(sample[0]), 3)
+        if start is None:
             return points
-        velocity = _rates(velocities, sample[0], len(moved))
-        if _bracket(accelerations, time) == sample:
-            velocity = velocity + 0.5 * seconds * _rates(accelerations, sample[0], len(moved))
-    except Unreadable as trouble:
-        report.warn(attribute.GetPrim().GetPath(), f"{trouble}; the points are interpolated instead")
+        velocity = _rates(velocities, sample[0], len(start))
+        if _bracketing_samples(accelerations, time) == sample:
+            velocity = velocity + 0.5 * seconds * _rates(accelerations, sample[0], len(start))
+    except Unreadable as error:
+        report.warn(attribute.GetPrim().GetPath(), f"{error}; the points are interpolated instead")
         return points
-    carried: Floats = moved + seconds * velocity
-    return carried
+    extrapolated: Floats = start + seconds * velocity
+    return extrapolated
 
 
-def turned(
+def extrapolated_rotation(
     attribute: Usd.Attribute, rates: Usd.Attribute, time: Usd.TimeCode, count: int, report: Report
 ) -> tuple[Usd.TimeCode, Floats | None]:
-    """When orientations are to be read, and the rotation vectors [count, 3] in radians that follow them, or None."""
-    seconds = _since_sample(attribute, rates, time)
+    """The time at which orientations are to be read, and the rotations that follow them.
+
+    Returns:
+        The time of the sample before and rotation vectors [count, 3] in radians; `time` itself and None if angular
+        velocities do not apply.
+    """
+    seconds = _seconds_since_sample(attribute, rates, time)
     if seconds == 0.0:
         return time, None
-    sample = _bracket(attribute, time)
+    sample = _bracketing_samples(attribute, time)
     assert sample is not None
     try:
         return Usd.TimeCode(sample[0]), np.radians(_rates(rates, sample[0], count)) * seconds
-    except Unreadable as trouble:
-        report.warn(attribute.GetPrim().GetPath(), f"{trouble}; the orientations are interpolated instead")
+    except Unreadable as error:
+        report.warn(attribute.GetPrim().GetPath(), f"{error}; the orientations are interpolated instead")
         return time, None
 
 
-def _since_sample(attribute: Usd.Attribute, velocities: Usd.Attribute, time: Usd.TimeCode) -> float:
-    """Seconds since the sample before a moment; 0 if velocities do not carry it on."""
+def _seconds_since_sample(attribute: Usd.Attribute, velocities: Usd.Attribute, time: Usd.TimeCode) -> float:
+    """Seconds since the time sample before a time; 0 if velocities do not apply."""
     if time.IsDefault() or not velocities or not velocities.HasAuthoredValue():
         return 0.0
-    sample = _bracket(attribute, time)
-    if sample is None or _bracket(velocities, time) != sample:
+    sample = _bracketing_samples(attribute, time)
+    if sample is None or _bracketing_samples(velocities, time) != sample:
         return 0.0
     return float((time.GetValue() - sample[0]) / attribute.GetPrim().GetStage().GetTimeCodesPerSecond())
 
 
 def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
-    """The velocities or accelerations [count, 3] of a sample."""
+    """Velocities or accelerations [count, 3] of a time sample.
+
+    Raises:
+        Unreadable: There is not one finite vector per point.
+    """
     rates = read.floats(attribute, Usd.TimeCode(sample), 3)
     if rates is None or len(rates) != count:
         raise Unreadable(f"{attribute.GetName()} has {0 if rates is None else len(rates)} values for {count} points")
@@ -75,10 +85,10 @@ def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
     return rates
 
 
-def _bracket(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
-    """The times of the samples before and after a moment; None without samples.
+def _bracketing_samples(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
+    """The times of the samples before and after a time; None without samples.
 
-    Velocities go with points only if both have the same: that is how USD knows that they were made together.
+    As in USD, velocities apply to points only if the bracketing samples of both are the same.
     """
     samples = attribute.GetBracketingTimeSamples(time.GetValue()) if attribute else ()
     return (samples[0], samples[1]) if samples else None

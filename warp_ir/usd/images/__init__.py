@@ -1,1 +1,1 @@
-"""Image files to pixels, and what shading networks make of them."""
+"""Image assets: decoding, caching, environment map layouts, and values of shading networks as images."""

@@ -1,7 +1,7 @@
-"""Image assets: bytes through USD's resolver, so that a .usdz works, decoded by OpenImageIO, in linear light.
+"""Image assets, decoded by OpenImageIO to linear light; bytes come from USD's resolver, so that .usdz works.
 
-Whatever a file says of itself is checked before anything is allocated, and an image with more pixels than asked
-for is averaged down while it is read, a band of rows at a time.
+The size that a file claims is checked before memory is allocated. An image with too many pixels is averaged down
+while it is read, a band of rows at a time.
 """
 
 import math
@@ -11,27 +11,29 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from pxr import Ar, Sdf
 
 from warp_ir.scene import Floats
+from warp_ir.usd.values import source_color_space
 from warp_ir.usd.values.report import Unreadable
-from warp_ir.usd.values.source_color_space import color_space as named
 from warp_ir.usd.values.source_color_space import decoder, srgb_to_linear
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    import OpenImageIO as oiio
+
 MAX_PIXELS = 4096 * 4096
-"""An image with more is averaged down to at most so many."""
+"""Maximum number of pixels; an image with more is averaged down."""
 _MAX_VALUES = 2**31
-"""Pixels times channels of the largest image that is decoded at all: beyond it is a mistake or an attack."""
-_BAND = 2**22
-"""Values decoded at once."""
-_RAW = {"linear", "lin_rec709", "lin_rec709_scene", "scene_linear", "raw", "data"}
+"""Maximum of pixels times channels in a file; one that claims more is taken for damaged or malicious."""
+_VALUES_PER_BAND = 2**22
+"""Values (pixels times channels) decoded at once."""
+_LINEAR_NAMES = {"linear", "lin_rec709", "lin_rec709_scene", "scene_linear", "raw", "data"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +43,17 @@ class Image:
     pixels: npt.NDArray[np.float32]
     """float32 [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4 (rgb, alpha)."""
     width: int
-    """In the file: `pixels` may be fewer."""
+    """Width in the file; `pixels` may be averaged down."""
     height: int
+    """Height in the file."""
     decoded: bool = False
-    """Whether colour was not linear in the file."""
+    """Whether a transfer function was decoded, that is, colour was not linear in the file."""
     wrap: tuple[str, str] = ("", "")
-    """Wrap modes in s and t that the file asks for: "black", "clamp", "repeat", "mirror", or "" if it does not."""
+    """Wrap modes in s and t from the file's metadata: "black", "clamp", "repeat", "mirror", or "" for none."""
 
     @property
     def rgb(self) -> npt.NDArray[np.float32]:
-        """The colour, float32 [h, w, 3]; grey is spread over the channels."""
+        """The colour, float32 [h, w, 3]; grey is repeated in all channels."""
         count = self.pixels.shape[2]
         if count >= 3:
             return self.pixels[..., :3]
@@ -58,7 +61,7 @@ class Image:
 
     @property
     def alpha(self) -> npt.NDArray[np.float32]:
-        """float32 [h, w]; 1 where the file has none."""
+        """Alpha, float32 [h, w]; 1 if the file has none."""
         count = self.pixels.shape[2]
         return self.pixels[..., count - 1] if count in (2, 4) else np.ones(self.pixels.shape[:2], np.float32)
 
@@ -67,15 +70,15 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
     """Reads an image asset.
 
     Args:
-        asset: As an attribute gives it, resolved by USD; or a resolved path, which may lie in a package
+        asset: The value of an attribute, resolved by USD; or a resolved path, which may be in a package
             (`a.usdz[b.png]`).
-        color_space: UsdUVTexture's sourceColorSpace: "raw", "sRGB", or "auto": sRGB for 8 bits and three or four
-            channels unless the file says otherwise; or another colour space, of which the primaries are kept. Only
-            colour is ever decoded, never alpha.
-        max_pixels: An image with more is averaged down by a whole factor.
+        color_space: UsdUVTexture's sourceColorSpace: "raw", "sRGB", or "auto" (sRGB for 8 bits and three or four
+            channels unless the file's metadata names a linear space); or another colour space, whose transfer function
+            is decoded and whose primaries are left. Alpha is never decoded.
+        max_pixels: An image with more pixels is averaged down by an integer factor.
 
     Raises:
-        Unreadable: There is no such file, it is no image, or it is too large to be one; the message names the asset.
+        Unreadable: There is no such file, it is no image, or it claims too many pixels; the message names the asset.
     """
     authored = asset if isinstance(asset, str) else asset.path
     resolved = asset if isinstance(asset, str) else asset.resolvedPath
@@ -84,7 +87,7 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
     import OpenImageIO as oiio
 
     with _file(resolved) as path:
-        # Values as stored: no reader may multiply colour by alpha.
+        # Colour must not be multiplied by alpha on reading.
         hints = oiio.ImageSpec()
         hints.attribute("oiio:UnassociatedAlpha", 1)
         reader = None if path is None else oiio.ImageInput.open(path, hints)
@@ -94,8 +97,8 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
             if reader is None:
                 raise Unreadable(f"cannot be read: {_first_line(oiio.geterror(), path)}")
             return _decode(reader, path, color_space, max_pixels)
-        except Unreadable as trouble:
-            raise Unreadable(f"image '{_short(authored)}' {trouble}") from None
+        except Unreadable as error:
+            raise Unreadable(f"image '{_short(authored)}' {error}") from None
         finally:
             if reader is not None:
                 reader.close()
@@ -103,8 +106,8 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
 
 @contextmanager
 def _file(resolved: str) -> "Iterator[str | None]":
-    """A path that OpenImageIO can open: the file itself, or a copy of the bytes if they lie in a package."""
-    if os.path.exists(resolved):  # but no pipe, device or folder
+    """A path that OpenImageIO can open: the file itself, or a temporary copy if it is in a package; None if absent."""
+    if os.path.exists(resolved):  # pipes, devices and folders are no images
         yield resolved if os.path.isfile(resolved) else None
         return
     opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
@@ -113,38 +116,38 @@ def _file(resolved: str) -> "Iterator[str | None]":
         yield None
         return
     inner = Ar.SplitPackageRelativePathInner(resolved)[1] or resolved
-    # OpenImageIO's Python interface reads files only.
+    # OpenImageIO's Python interface reads only files, not memory.
     with tempfile.TemporaryDirectory(prefix="warp-ir-") as folder:
         path = Path(folder) / f"image{Path(inner).suffix}"
         path.write_bytes(content)
         yield str(path)
 
 
-def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
+def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: int) -> Image:
     import OpenImageIO as oiio
 
     spec = reader.spec()
     width, height, channels = int(spec.width), int(spec.height), int(spec.nchannels)
     if min(width, height, channels) < 1 or spec.depth > 1 or spec.deep:
-        raise Unreadable("is not a flat picture of at least one pixel")
+        raise Unreadable("is not a flat two-dimensional image of at least one pixel")
     if width * height * channels > _MAX_VALUES:
         raise Unreadable(f"claims {width} x {height} pixels of {channels} channels: too many")
     first, count = _channels(list(spec.channelnames))
     factor = max(1, math.isqrt(width * height // max_pixels))
     while -(-width // factor) * -(-height // factor) > max_pixels:
         factor += 1
-    # Bytes become light by a table.
-    bytes_only = spec.format.basetype == oiio.UINT8
-    decode = _decoder(spec, color_space, bytes_only)
+    is_uint8 = spec.format.basetype == oiio.UINT8
+    decode = _decoder(spec, color_space, is_uint8)
     colors = 0 if decode is None else count if count in (1, 3) else count - 1
+    # 8-bit values are decoded by a table of 256 entries.
     table = None if decode is None else decode(np.arange(256) / 255.0).astype(np.float32)
-    small = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
+    pixels = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
     tile = int(spec.tile_height) or 1
-    step = math.lcm(factor, tile)  # a band is whole rows of the result, and of tiles
-    rows = step * max(1, _BAND // (width * count * step))
+    step = math.lcm(factor, tile)  # a band holds whole rows of the result and whole tiles
+    rows = step * max(1, _VALUES_PER_BAND // (width * count * step))
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
-        y0, y1, kind = spec.y + top, spec.y + bottom, oiio.UINT8 if bytes_only else oiio.FLOAT
+        y0, y1, kind = spec.y + top, spec.y + bottom, oiio.UINT8 if is_uint8 else oiio.FLOAT
         if spec.tile_width:
             band = reader.read_tiles(0, 0, spec.x, spec.x + width, y0, y1, 0, 1, first, first + count, kind)
         else:
@@ -152,17 +155,17 @@ def _decode(reader: Any, path: str, color_space: str, max_pixels: int) -> Image:
         if band is None:
             raise Unreadable(f"cannot be read: {_first_line(reader.geterror(), path)}")
         stored = np.asarray(band).reshape(bottom - top, width, count)
-        values = stored.astype(np.float32) / np.float32(255.0 if bytes_only else 1.0)
+        values = stored.astype(np.float32) / np.float32(255.0 if is_uint8 else 1.0)
         if decode is not None and table is not None:
-            values[..., :colors] = table[stored[..., :colors]] if bytes_only else decode(values[..., :colors])
-        small[top // factor : -(-bottom // factor)] = _averaged(values, factor)
-    if not np.isfinite(small).all():
-        small = np.nan_to_num(small, nan=0.0, posinf=65504.0, neginf=0.0)
-    return Image(small, width, height, decode is not None, _wrap_modes(spec))
+            values[..., :colors] = table[stored[..., :colors]] if is_uint8 else decode(values[..., :colors])
+        pixels[top // factor : -(-bottom // factor)] = _averaged(values, factor)
+    if not np.isfinite(pixels).all():
+        pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
+    return Image(pixels, width, height, decode is not None, _wrap_modes(spec))
 
 
 def _averaged(values: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:
-    """Means of squares of factor x factor pixels; what is left at the right and the bottom counts as it is."""
+    """Means of blocks of factor x factor pixels; blocks at the right and bottom edges may be smaller."""
     if factor == 1:
         return values
     down = np.arange(0, values.shape[0], factor)
@@ -175,7 +178,7 @@ def _averaged(values: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.fl
 
 
 def _channels(names: list[str]) -> tuple[int, int]:
-    """Where grey, rgb and alpha begin, and how many there are; other layers of an EXR are left alone."""
+    """First channel and number of channels of grey, RGB and alpha; other layers of an EXR are ignored."""
     if {"R", "G", "B"} <= set(names):
         first = names.index("R")
         if names[first : first + 3] == ["R", "G", "B"]:
@@ -183,17 +186,17 @@ def _channels(names: list[str]) -> tuple[int, int]:
     return 0, min(len(names), 4)
 
 
-def _decoder(spec: Any, color_space: str, bytes_only: bool) -> Callable[[Floats], Floats] | None:
-    """What makes colour linear; None if it is, or is no colour."""
+def _decoder(spec: "oiio.ImageSpec", color_space: str, is_uint8: bool) -> Callable[[Floats], Floats] | None:
+    """The decoding transfer function of an image; None if it is linear or holds no colour."""
     if color_space != "auto":
-        space = named(color_space)
+        space = source_color_space.color_space(color_space)
         return None if space is None else decoder(space)
-    says = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
-    # OpenImageIO calls every PNG sRGB, whether the file does or not: only what the pixels are decides then.
-    return srgb_to_linear if says not in _RAW and bytes_only and spec.nchannels in (3, 4) else None
+    metadata = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
+    # OpenImageIO reports sRGB for every PNG, so that only the pixel format can tell colour from data.
+    return srgb_to_linear if metadata not in _LINEAR_NAMES and is_uint8 and spec.nchannels in (3, 4) else None
 
 
-def _wrap_modes(spec: Any) -> tuple[str, str]:
+def _wrap_modes(spec: "oiio.ImageSpec") -> tuple[str, str]:
     known = {"black": "black", "clamp": "clamp", "periodic": "repeat", "mirror": "mirror"}
     modes = str(spec.get_string_attribute("wrapmodes")).lower().split(",")
     s = known.get(modes[0].strip(), "")

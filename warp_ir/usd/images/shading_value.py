@@ -1,23 +1,23 @@
-"""Values of shading networks: constants, images in place on a surface, or primvars.
+"""Values of shading networks: constants, images mapped to a surface, or functions of primvars.
 
-An image that is scaled, tinted or mixed with constants is again an image, so all of that is done once, here, and
-renders for nothing. Two images that lie in the same place are combined pixel by pixel; if they do not, the second
-counts as its mean.
+Networks are evaluated per texel when a stage is read, so that rendering costs one texture lookup: an image that is
+scaled, tinted or mixed with constants is an image again. Images of the same UV mapping are combined texel by texel;
+of images with different mappings, all but the first are replaced by their means.
 """
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_ir.image.mipmap import resized
 from warp_ir.scene import Floats, Wrap
 
 
 @dataclass(frozen=True)
-class Place:
-    """How an image lies on a surface."""
+class UVMapping:
+    """How an image is mapped to a surface: fields as in `Texture`."""
 
     uv: str = "st"
     transform: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -25,114 +25,120 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Primvar:
-    """Values that a surface may have at its corners."""
+class PrimvarRef:
+    """A primvar that a network reads."""
 
     name: str
     channels: int
 
 
-PrimvarValues = Mapping[Primvar, Floats]
-"""Those that a surface has, float [c] where they are the same everywhere, or [m, 3, c]."""
+PrimvarValues = Mapping[PrimvarRef, Floats]
+"""Values of the primvars that a surface has: float [c] if constant, else per corner [m, 3, c]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Signal:
-    """What comes out of a network."""
+class ShadingValue:
+    """The value of an output of a shading network."""
 
     pixels: Floats
     """float [h, w, c], [1, 1, c] for a constant; row 0 at the top."""
     outside: Floats
-    """float [c], the value beyond the image's edges."""
-    place: Place | None
-    """None: it is a constant."""
+    """float [c], the border value outside of the image (wrap mode BLACK)."""
+    mapping: UVMapping | None
+    """How the image is mapped to the surface; None: a constant."""
     key: Hashable
-    """Equal where the content is."""
+    """Equal for equal values."""
     name: str = ""
-    """Of the image."""
-    primvars: tuple[Primvar, ...] = ()
-    """What it depends on besides; `pixels` is the value where surfaces have none of them."""
-    of: Callable[[PrimvarValues], Floats] | None = None
-    """Its value, given those primvars that a surface has; images count as their means."""
+    """Path of the image."""
+    primvars: tuple[PrimvarRef, ...] = ()
+    """The primvars that it depends on; `pixels` is the value on surfaces without any of them."""
+    function: Callable[[PrimvarValues], Floats] | None = None
+    """The value as a function of primvars, images replaced by their means; None: independent of primvars."""
 
     @property
     def mean(self) -> Floats:
-        """Over the pixels, float64 [c]."""
+        """Mean over the pixels, float64 [c]."""
         return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
 
-    def at(self, values: PrimvarValues) -> Floats:
-        """Its value on a surface, [c] or [m, 3, c]."""
-        return self.mean if self.of is None else self.of(values)
+    def evaluate(self, primvars: PrimvarValues) -> Floats:
+        """The value on a surface with these primvars, [c] or [m, 3, c]."""
+        return self.mean if self.function is None else self.function(primvars)
 
 
-def from_primvar(primvar: Primvar, fallback: Signal) -> Signal:
-    """A surface's primvar, or a constant where it has none."""
-    without = np.resize(fallback.mean, primvar.channels)
+def from_primvar(primvar: PrimvarRef, fallback: ShadingValue) -> ShadingValue:
+    """The value of a primvar, or the mean of the fallback on surfaces without it."""
+    default = np.resize(fallback.mean, primvar.channels)
     return replace(
-        constant(*without.tolist()), primvars=(primvar,), of=lambda values: values.get(primvar, without), key=primvar
+        constant(*default.tolist()),
+        primvars=(primvar,),
+        function=lambda values: values.get(primvar, default),
+        key=primvar,
     )
 
 
-def constant(*channels: float) -> Signal:
-    """The same everywhere."""
-    at = np.array(channels, np.float64)
-    return Signal(at.reshape(1, 1, -1), at, None, tuple(channels))
+def constant(*channels: float) -> ShadingValue:
+    """A constant of one value per channel."""
+    value = np.array(channels, np.float64)
+    return ShadingValue(value.reshape(1, 1, -1), value, None, tuple(channels))
 
 
-def combine(label: Hashable, function: Callable[..., Any], *signals: Signal) -> Signal:
-    """A function of signals, pixel by pixel; it takes and gives arrays [..., c].
+def combine(label: Hashable, function: Callable[..., npt.ArrayLike], *values: ShadingValue) -> ShadingValue:
+    """Applies a function to values, texel by texel.
 
     Args:
-        label: Tells functions apart.
-        function: Of as many arrays.
-        signals: Their arguments.
+        label: Identifies the function in the key of the result.
+        function: Takes one array [..., c] per value and returns an array [..., c].
+        values: The arguments of the function.
     """
-    images = [s for s in signals if s.place is not None]
-    key = (label, *(s.key for s in signals))
-    primvars = tuple(dict.fromkeys(p for s in signals for p in s.primvars))
-    of = (lambda values: _finite(function(*(s.at(values) for s in signals)))) if primvars else None
+    images = [v for v in values if v.mapping is not None]
+    key = (label, *(v.key for v in values))
+    primvars = tuple(dict.fromkeys(p for v in values for p in v.primvars))
+    of_primvars = (lambda given: _finite(function(*(v.evaluate(given) for v in values)))) if primvars else None
     if not images:
-        made = _finite(function(*(s.pixels for s in signals)))
-        return Signal(made, made[0, 0], None, key, "", primvars, of)
+        result = _finite(function(*(v.pixels for v in values)))
+        return ShadingValue(result, result[0, 0], None, key, "", primvars, of_primvars)
     first = images[0]
-    together = [s for s in images if s.place == first.place]
-    height, width = (max(s.pixels.shape[axis] for s in together) for axis in (0, 1))
+    aligned = [v for v in images if v.mapping == first.mapping]
+    height, width = (max(v.pixels.shape[axis] for v in aligned) for axis in (0, 1))
     pixels, outside = [], []
-    for s in signals:
-        if s.place is not None and s.place != first.place:
-            pixels.append(s.mean.reshape(1, 1, -1))
-            outside.append(s.mean)
+    for v in values:
+        if v.mapping is not None and v.mapping != first.mapping:
+            pixels.append(v.mean.reshape(1, 1, -1))
+            outside.append(v.mean)
         else:
-            fits = s.place is None or s.pixels.shape[:2] == (height, width)
-            pixels.append(s.pixels if fits else resized(s.pixels, height, width))
-            outside.append(s.outside)
-    made = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
-    made = np.broadcast_to(made, (height, width, made.shape[-1]))
-    return Signal(compact(made), _finite(function(*outside)), first.place, key, first.name, primvars, of)
+            fits = v.mapping is None or v.pixels.shape[:2] == (height, width)
+            pixels.append(v.pixels if fits else resized(v.pixels, height, width))
+            outside.append(v.outside)
+    result = _finite(function(*(np.asarray(p, np.float32) for p in pixels)))
+    result = np.broadcast_to(result, (height, width, result.shape[-1]))
+    border = _finite(function(*outside))
+    return ShadingValue(compact(result), border, first.mapping, key, first.name, primvars, of_primvars)
 
 
-def _finite(values: Floats) -> Floats:
-    """Arithmetic in a file may overflow."""
-    return np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
+def _finite(values: npt.ArrayLike) -> Floats:
+    """The values with NaN replaced by 0 and infinities by ±3e38: authored arithmetic may overflow."""
+    finite: Floats = np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
+    return finite
 
 
-def select(signal: Signal, channels: list[int]) -> Signal:
-    """Some channels, in any order."""
-    pixels, outside = signal.pixels[..., channels], np.asarray(signal.outside)[channels]
-    of = None if signal.of is None else lambda values: signal.at(values)[..., channels]
-    return replace(signal, pixels=pixels, outside=outside, key=("select", tuple(channels), signal.key), of=of)
+def select(value: ShadingValue, channels: list[int]) -> ShadingValue:
+    """The given channels of a value, in that order."""
+    pixels, outside = value.pixels[..., channels], np.asarray(value.outside)[channels]
+    function = None if value.function is None else lambda primvars: value.evaluate(primvars)[..., channels]
+    key = ("select", tuple(channels), value.key)
+    return replace(value, pixels=pixels, outside=outside, key=key, function=function)
 
 
-def as_color(signal: Signal) -> Signal:
-    """Three channels: the first three, or one thrice."""
-    count = signal.pixels.shape[2]
+def as_color(value: ShadingValue) -> ShadingValue:
+    """A value of three channels: the first three, or the first one repeated."""
+    count = value.pixels.shape[2]
     if count == 3:
-        return signal
-    return select(signal, [0, 1, 2] if count > 3 else [0, 0, 0])
+        return value
+    return select(value, [0, 1, 2] if count > 3 else [0, 0, 0])
 
 
 def compact(pixels: Floats) -> Floats:
-    """In halves where they are enough: 11 bits from 6e-5 to 65504."""
+    """The pixels in half precision (11 significant bits from 6e-5 to 65504), unless one exceeds its range."""
     if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
         return pixels
     return pixels.astype(np.float16)

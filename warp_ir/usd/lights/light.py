@@ -15,13 +15,13 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd.images.asset import read_texture
-from warp_ir.usd.images.cache import inherited_space
+from warp_ir.usd.images.cache import inherited_color_space
 from warp_ir.usd.images.latlong import LAYOUTS, to_latlong
 from warp_ir.usd.lights.inputs import Inputs
 from warp_ir.usd.lights.shaping import read_shaping
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.source_color_space import between, color_space
+from warp_ir.usd.values.source_color_space import color_space, rgb_conversion_matrix
 
 LIGHTS = {
     "RectLight": LightKind.RECT,
@@ -191,7 +191,7 @@ def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
     space = str(attribute.GetColorSpace() or "auto")
     try:
         image = read_texture(asset, space, _TEXELS[kind])
-        inherited = inherited_space(attribute, image) if space == "auto" else ""
+        inherited = inherited_color_space(attribute, image) if space == "auto" else ""
         image = read_texture(asset, inherited, _TEXELS[kind]) if inherited else image
         primaries = color_space(inherited or space)
         pixels = to_latlong(image.rgb, layout) if layout in LAYOUTS else image.rgb
@@ -199,7 +199,7 @@ def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
         inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
         return None
     if primaries is not None:
-        pixels = pixels @ between(primaries, None).T.astype(np.float32)
+        pixels = pixels @ rgb_conversion_matrix(primaries, None).T.astype(np.float32)
     return np.clip(pixels, 0.0, _BRIGHTEST_TEXEL)
 
 

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from warp_ir.scene import Floats, Ints, Material
-from warp_ir.usd.images.cache import Images
-from warp_ir.usd.images.shading_value import Signal
+from warp_ir.scene import Bools, Floats, Ints, Material
+from warp_ir.usd.images.cache import ImageCache
+from warp_ir.usd.images.shading_value import ShadingValue
 from warp_ir.usd.lights.light import BRIGHTEST
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, order_of
 from warp_ir.usd.shading.surface_shader import Surface, read_material
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.triangles import Mask, Shape
+from warp_ir.usd.values.triangles import TriangleMesh
 
 ABSENT = -1
 """In place of a material's index: the surface is not there (opacity)."""
@@ -33,16 +33,16 @@ class Look:
     """int32 [m], indices into the table, or ABSENT."""
     colors: Floats | None = None
     """float32 [m, 3, 3], albedo of the corners where one per triangle is not enough; None elsewhere."""
-    bare: Mask | None = None
+    bare: Bools | None = None
     """bool [m], triangles with neither material nor colour, that an instancer may still colour; None: none."""
     uvs: Mapping[str, Floats] = field(default_factory=dict)
     """float32 [m, 3, 2], the texture coordinates that the materials need, by name."""
-    asked: tuple[tuple[Mask, Signal], ...] = ()
+    asked: tuple[tuple[Bools, ShadingValue], ...] = ()
     """bool [m], triangles whose albedo depends on primvars that the prim lacks, and an instancer may have; and how."""
     unread: frozenset[str] = frozenset()
     """Such primvars that emission or opacity depend on: of instancers they are not read."""
 
-    def keep(self, mask: Mask) -> "Look":
+    def keep(self, mask: Bools) -> "Look":
         """The look of the triangles that a mask [m] selects."""
         colors = None if self.colors is None else self.colors[mask]
         uvs = {name: corners[mask] for name, corners in self.uvs.items()}
@@ -67,14 +67,14 @@ class MaterialTable:
         self,
         time: Usd.TimeCode,
         report: Report,
-        images: Images | None = None,
+        images: ImageCache | None = None,
         metals: str = "diffuse",
         purposes: Sequence[str] = PURPOSES[:2],
     ) -> None:
         self.materials: list[Material] = []
         self._purposes = purposes
         self._time, self._report = time, report
-        self._images, self._black_metals = images or Images(report), metals == "black"
+        self._images, self._black_metals = images or ImageCache(report), metals == "black"
         self._images.report = report
         self._asked: dict[int, Surface] = {}
         self._known: dict[Material, int] = {}
@@ -102,21 +102,21 @@ class MaterialTable:
             elif (target := _dangling_target(prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the material it is bound to, {target}, does not exist")
 
-    def look(self, prim: Usd.Prim, shape: Shape) -> Look:
+    def look(self, prim: Usd.Prim, shape: TriangleMesh) -> Look:
         """The materials and colours of a prim's triangles; `resolve` has seen the prim."""
         index = np.full(len(shape.triangles), self._bound.get(prim.GetPath(), UNBOUND), dtype=np.int32)
         for faces, bound in self._subsets(prim, shape):
             index[faces[shape.face]] = bound
         return replace(self._colored(prim, shape, index), uvs=self._uvs(prim, shape, index))
 
-    def _colored(self, prim: Usd.Prim, shape: Shape, index: Ints) -> Look:
+    def _colored(self, prim: Usd.Prim, shape: TriangleMesh, index: Ints) -> Look:
         """The look of triangles with a material each: displayColor where there is none, primvars where it asks."""
         bare = index == UNBOUND
         asked = {int(k): self._asked[k] for k in np.unique(index) if k in self._asked}
         if not bare.any() and not asked:
             return Look(index)
         colors: Floats | None = None
-        lacking: list[tuple[Mask, Signal]] = []
+        lacking: list[tuple[Bools, ShadingValue]] = []
         unread = frozenset(
             wanted.name
             for surface in asked.values()
@@ -158,7 +158,7 @@ class MaterialTable:
             self._report.warn(material.name, "its image counts as its mean where primvars are read")
         return plain
 
-    def _varied(self, prim: Usd.Prim, shape: Shape, surface: Surface, material: Material) -> Ints:
+    def _varied(self, prim: Usd.Prim, shape: TriangleMesh, surface: Surface, material: Material) -> Ints:
         """The material of each triangle, int32 [m], where emission or opacity may depend on primvars."""
         count = len(shape.triangles)
         emission = self._from_primvars(prim, shape, surface.emission, "emission", BRIGHTEST)
@@ -204,7 +204,7 @@ class MaterialTable:
         return self.add(replace(material, emission=(red, green, blue), opacity=opacity))
 
     def _from_primvars(
-        self, prim: Usd.Prim, shape: Shape, signal: Signal | None, what: str, largest: float
+        self, prim: Usd.Prim, shape: TriangleMesh, signal: ShadingValue | None, what: str, largest: float
     ) -> Floats | None:
         """What depends on primvars, [c] or [m, 3, c]; None if nothing does, or if the prim has none of them."""
         values = {}
@@ -214,13 +214,13 @@ class MaterialTable:
                 values[asked] = found
         if signal is None or not values:
             return None
-        found = signal.at(values)
+        found = signal.evaluate(values)
         if found.min() < 0.0 or found.max() > largest:
             names = ", ".join(asked.name for asked in values)
             self._report.warn(prim.GetPath(), f"{what} of the primvar {names} outside [0, {largest:g}] clamped")
         return found.clip(0.0, largest)
 
-    def _bare(self, prim: Usd.Prim, shape: Shape, index: Ints, bare: Mask) -> Look:
+    def _bare(self, prim: Usd.Prim, shape: TriangleMesh, index: Ints, bare: Bools) -> Look:
         """The look of a prim of whose triangles some have no material."""
         color = primvar.display_color(prim, shape, self._time, self._report)
         if color is None:
@@ -236,14 +236,14 @@ class MaterialTable:
         colors = np.where(bare[:, None, None], color.astype(np.float32), self.albedo(index)[:, None])
         return Look(index, colors)
 
-    def _index_bare(self, index: Ints, bare: Mask, prim: Usd.Prim, shape: Shape, material: Material) -> None:
+    def _index_bare(self, index: Ints, bare: Bools, prim: Usd.Prim, shape: TriangleMesh, material: Material) -> None:
         """Gives a material to the triangles that have none, of the prim's own displayOpacity."""
         opacity = primvar.display_opacity(prim, shape, self._time, self._report)
         distinct, inverse = np.unique(opacity, return_inverse=True)
         variants = [self._variant(material, (*material.emission, value)) for value in distinct.tolist()]
         index[bare] = np.array(variants, np.int32)[np.broadcast_to(inverse.reshape(-1), index.shape)][bare]
 
-    def _uvs(self, prim: Usd.Prim, shape: Shape, index: Ints) -> dict[str, Floats]:
+    def _uvs(self, prim: Usd.Prim, shape: TriangleMesh, index: Ints) -> dict[str, Floats]:
         """The texture coordinates that a prim's materials need, and that it has."""
         used = (self.materials[k] for k in np.unique(index[index >= 0]))
         names = dict.fromkeys(texture.uv for material in used for texture in material.textures)
@@ -259,10 +259,10 @@ class MaterialTable:
         table: Floats = np.array([m.albedo for m in self.materials], dtype=np.float32)
         return table[index]
 
-    def _subsets(self, prim: Usd.Prim, shape: Shape) -> list[tuple[Mask, int]]:
+    def _subsets(self, prim: Usd.Prim, shape: TriangleMesh) -> list[tuple[Bools, int]]:
         """Face masks, bool [faces], with the material bound to them; the first subset of a face wins."""
-        count = shape.elements.get("uniform")
-        pairs: list[tuple[Mask, int]] = []
+        count = shape.element_counts.get("uniform")
+        pairs: list[tuple[Bools, int]] = []
         if count is None:
             return pairs
         taken = np.zeros(count, dtype=bool)

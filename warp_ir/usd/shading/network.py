@@ -8,8 +8,17 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from warp_ir.scene import Floats, Texture, Wrap
-from warp_ir.usd.images.cache import Images
-from warp_ir.usd.images.shading_value import Place, Primvar, Signal, as_color, combine, constant, from_primvar, select
+from warp_ir.usd.images.cache import ImageCache
+from warp_ir.usd.images.shading_value import (
+    PrimvarRef,
+    ShadingValue,
+    UVMapping,
+    as_color,
+    combine,
+    constant,
+    from_primvar,
+    select,
+)
 from warp_ir.usd.shading.vendor_shaders import shader_name
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Unreadable
@@ -47,7 +56,7 @@ class Network:
         time: Of the values.
     """
 
-    def __init__(self, images: Images, material: object, time: Usd.TimeCode) -> None:
+    def __init__(self, images: ImageCache, material: object, time: Usd.TimeCode) -> None:
         self._images, self._time = images, time
         self.material = material
         self._nodes = 0
@@ -56,11 +65,11 @@ class Network:
         """Say something about the material."""
         self._images.report.warn(self.material, what)
 
-    def texture(self, signal: Signal) -> Texture:
+    def texture(self, signal: ShadingValue) -> Texture:
         """A signal that has a place, as a texture."""
         return self._images.texture(signal)
 
-    def evaluate(self, shader_input: UsdShade.Input, default: Signal) -> Signal:
+    def evaluate(self, shader_input: UsdShade.Input, default: ShadingValue) -> ShadingValue:
         """What a shader's input gets; the default where nothing is authored, or where it cannot be read."""
         self._nodes = 0
         try:
@@ -77,7 +86,7 @@ class Network:
 
     def picture(
         self, shader_input: UsdShade.Input, channels: list[int], uv: str, transform: Floats, *, color: bool
-    ) -> Signal | None:
+    ) -> ShadingValue | None:
         """The image that an input names, repeated, or what is connected to it; None where no image can be read.
 
         Args:
@@ -101,7 +110,9 @@ class Network:
             self.warn(f"{shader_input.GetBaseName()}: {trouble}; it is left out")
             return None
 
-    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+    def file(
+        self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats
+    ) -> ShadingValue | None:
         """An image, repeated, as `picture` has it; None where it cannot be read."""
         try:
             pixels, key = self._images.pixels(asset, space, channels)
@@ -109,16 +120,16 @@ class Network:
         except Unreadable as trouble:
             self.warn(f"{trouble}; it is left out")
             return None
-        return Signal(pixels, np.zeros(len(channels)), place, (key, tuple(channels)), asset.path)
+        return ShadingValue(pixels, np.zeros(len(channels)), place, (key, tuple(channels)), asset.path)
 
     def _file(
         self,
         attribute: Usd.Attribute | None,
         channels: list[int],
         space: str,
-        place: Callable[[tuple[int, int]], Place],
+        place: Callable[[tuple[int, int]], UVMapping],
         outside: Floats | None = None,
-    ) -> Signal:
+    ) -> ShadingValue:
         """Channels of the image that an attribute names; `place` says where, given the UDIM tiles across and up.
 
         Raises:
@@ -128,9 +139,9 @@ class Network:
         _, pixels, key, atlas = self._images.look_up(
             attribute, self._time, space, np.resize(outside, 4), channels, self.warn
         )
-        return Signal(pixels, outside, place(atlas), (key, tuple(channels)), self._path(attribute))
+        return ShadingValue(pixels, outside, place(atlas), (key, tuple(channels)), self._path(attribute))
 
-    def _input(self, shader_input: UsdShade.Input, default: Signal, depth: int) -> Signal:
+    def _input(self, shader_input: UsdShade.Input, default: ShadingValue, depth: int) -> ShadingValue:
         attribute = read.producer(shader_input)
         if attribute is None:
             return default
@@ -157,7 +168,7 @@ class Network:
         reader, _, kind = name.partition("_")
         if reader in _READERS and kind in _CHANNELS:
             named, otherwise = _READERS[reader]
-            primvar = Primvar(self._text(node.GetInput(named)), _CHANNELS[kind])
+            primvar = PrimvarRef(self._text(node.GetInput(named)), _CHANNELS[kind])
             fallback = self._input(node.GetInput(otherwise), constant(*[0.0] * primvar.channels), depth - 1)
             return from_primvar(primvar, fallback)
         if identifier.startswith("ND_"):
@@ -174,10 +185,10 @@ class Network:
             return self._file(attribute, channels, "auto", _placed_by(uv, np.eye(3)))
         raise Unreadable(f"the node {kind or identifier} is not understood")
 
-    def _operation(self, node: UsdShade.Shader, name: str, output: str, depth: int) -> Signal | None:
+    def _operation(self, node: UsdShade.Shader, name: str, output: str, depth: int) -> ShadingValue | None:
         """MaterialX's arithmetic; None if the node is none."""
 
-        def get(key: str, *default: float) -> Signal:
+        def get(key: str, *default: float) -> ShadingValue:
             return self._input(node.GetInput(key), constant(*default), depth)
 
         kind = name.split("_")[0]
@@ -228,7 +239,7 @@ class Network:
             )
         return None
 
-    def _uv_texture(self, node: UsdShade.Shader, output: str, default: Signal) -> Signal:
+    def _uv_texture(self, node: UsdShade.Shader, output: str, default: ShadingValue) -> ShadingValue:
         """UsdUVTexture: out = image * scale + bias."""
         fallback = self._constant(node, "fallback", [0.0, 0.0, 0.0, 1.0])
         scale, bias = self._constant(node, "scale", [1.0] * 4), self._constant(node, "bias", [0.0] * 4)
@@ -252,13 +263,13 @@ class Network:
         place = _placed(uv, transform, (wraps[0], wraps[1]), atlas)
         outside = fallback if atlas != (1, 1) else np.zeros(4)  # black is transparent black
         key = (key, tuple(channels))
-        signal = Signal(pixels, outside[channels], place, key, self._path(attribute))
+        signal = ShadingValue(pixels, outside[channels], place, key, self._path(attribute))
         if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
             return signal
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
         return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), signal)
 
-    def _image(self, node: UsdShade.Shader, name: str, output: str) -> Signal:
+    def _image(self, node: UsdShade.Shader, name: str, output: str) -> ShadingValue:
         """MaterialX's image and tiledimage, and glTF's images in MaterialX."""
         gltf = name.startswith("gltf_")
         wanted = name.removesuffix("_1_0").rsplit("_", 1)[-1]
@@ -306,8 +317,8 @@ class Network:
         """The uv set that an input reads, and what is done to it, [3, 3]."""
         attribute = read.producer(shader_input)
         if attribute is None or not UsdShade.Output.IsOutput(attribute):
-            authored = read.raw(attribute, self._time) if attribute is not None else None
-            if authored is None or np.shape(authored) != (2,) or not np.isfinite(authored).all():
+            authored = np.asarray(read.raw(attribute, self._time) if attribute is not None else None)
+            if authored.shape != (2,) or authored.dtype.kind not in "fiu" or not np.isfinite(authored).all():
                 return "st", unconnected
             return "st", _at(float(authored[0]), float(authored[1]))
         node = UsdShade.Shader(attribute.GetPrim())
@@ -360,19 +371,19 @@ def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
 
 def _placed_by(
     uv: str, transform: Floats, wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
-) -> Callable[[tuple[int, int]], Place]:
+) -> Callable[[tuple[int, int]], UVMapping]:
     """Where an image lies, given its UDIM tiles."""
     return lambda tiles: _placed(uv, transform, wrap, tiles)
 
 
-def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> Place:
+def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> UVMapping:
     if tiles != (1, 1):
         transform = np.diag([1.0 / tiles[0], 1.0 / tiles[1], 1.0]) @ transform
         wrap = (Wrap.BLACK, Wrap.BLACK)
     if not (np.abs(transform) < 1e30).all():
         raise Unreadable("the transform of the texture coordinates is not finite")
     s, t = transform[0].tolist(), transform[1].tolist()
-    return Place(uv, ((s[0], s[1], s[2]), (t[0], t[1], t[2])), wrap)
+    return UVMapping(uv, ((s[0], s[1], s[2]), (t[0], t[1], t[2])), wrap)
 
 
 def _at(s: float, t: float) -> Floats:

@@ -12,8 +12,8 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from warp_ir.scene import Color, Floats, Material, Wrap
-from warp_ir.usd.images.cache import Images
-from warp_ir.usd.images.shading_value import Place, Signal, as_color, combine, constant
+from warp_ir.usd.images.cache import ImageCache
+from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, as_color, combine, constant
 from warp_ir.usd.lights.light import BRIGHTEST
 from warp_ir.usd.shading.network import Network
 from warp_ir.usd.shading.vendor_shaders import reader_of, shader_name
@@ -32,18 +32,18 @@ class Surface:
     """What a material looks like."""
 
     material: Material
-    albedo: Signal | None = None
+    albedo: ShadingValue | None = None
     """If it depends on primvars: what the albedo is where surfaces have them."""
-    emission: Signal | None = None
+    emission: ShadingValue | None = None
     """Likewise."""
-    opacity: Signal | None = None
+    opacity: ShadingValue | None = None
     """Likewise."""
     threshold: float = 0.0
     """Of the opacity: if it is more than 0, surfaces below it are absent, and others opaque."""
 
 
 def read_material(
-    material: UsdShade.Material, time: Usd.TimeCode, images: Images, *, black_metals: bool = False
+    material: UsdShade.Material, time: Usd.TimeCode, images: ImageCache, *, black_metals: bool = False
 ) -> Surface | None:
     """What a bound material looks like; None if its opacity makes the surface absent.
 
@@ -93,11 +93,11 @@ class _Inputs:
         self._shader, self.network, self.black_metals = shader, network, black_metals
         self.warn = network.warn
 
-    def color(self, name: str, default: Color) -> Signal:
+    def color(self, name: str, default: Color) -> ShadingValue:
         """A colour."""
         return as_color(self.network.evaluate(self._shader.GetInput(name), constant(*default)))
 
-    def grey(self, name: str, default: float) -> Signal:
+    def grey(self, name: str, default: float) -> ShadingValue:
         """One channel."""
         found = self.network.evaluate(self._shader.GetInput(name), constant(default))
         return found if found.pixels.shape[2] == 1 else combine("grey", _mean_channel, found)
@@ -116,7 +116,9 @@ class _Inputs:
         """A token; a number in digits."""
         return self.network.word(self._shader.GetInput(name))
 
-    def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
+    def picture(
+        self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool
+    ) -> ShadingValue | None:
         """The image that an input names, or what is connected to it; None where it names none that can be read.
 
         Args:
@@ -128,11 +130,13 @@ class _Inputs:
         """
         return self.network.picture(self._shader.GetInput(name), channels, uv, transform, color=color)
 
-    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+    def file(
+        self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats
+    ) -> ShadingValue | None:
         """An image, repeated; None where it cannot be read."""
         return self.network.file(asset, channels, space, uv, transform)
 
-    def normal(self, name: str, *, tangent: bool) -> Signal | None:
+    def normal(self, name: str, *, tangent: bool) -> ShadingValue | None:
         """A normal map, in tangent space; None where there is none, or a flat one.
 
         Args:
@@ -152,20 +156,20 @@ class _Inputs:
         found = as_color(self.network.evaluate(self._shader.GetInput(name), constant(0.0, 0.0, 1.0)))
         return self.tangent_normal(name, found)
 
-    def tangent_normal(self, name: str, found: Signal) -> Signal | None:
+    def tangent_normal(self, name: str, found: ShadingValue) -> ShadingValue | None:
         """A normal map in tangent space as it is stored; None for a flat one."""
         self.without_primvars(name, found)
         if np.abs(found.pixels).max() > 1.0:
             found = combine("normal", lambda n: np.clip(n, -1.0, 1.0), found)
         x, y, z = found.mean.tolist()
-        if found.place is None:
-            return None if x == y == 0.0 else replace(found, place=Place())  # one texel
+        if found.mapping is None:
+            return None if x == y == 0.0 else replace(found, mapping=UVMapping())  # one texel
         if math.hypot(x, y) > 0.5 * abs(z):
             self.warn(f"{name}: the map leans to one side; is it raw, with scale 2 and bias -1 ({{n}} materials)?")
         # Beyond an image that ends, the surface is smooth.
         return replace(found, outside=np.array([0.0, 0.0, 1.0]), key=("normal", found.key))
 
-    def without_primvars(self, what: str, signal: Signal) -> None:
+    def without_primvars(self, what: str, signal: ShadingValue) -> None:
         """Name the primvars that count as their readers' fallbacks."""
         for primvar in signal.primvars:
             self.warn(f"{what} reads the primvar '{primvar.name}': it takes the reader's fallback")
@@ -273,13 +277,13 @@ def _unit(pixels: Floats) -> Floats:
     return np.clip(pixels, 0.0, 1.0)
 
 
-def _scaled(color: Signal, weight: Signal) -> Signal:
-    if weight.place is None and not weight.primvars and weight.mean[0] == 1.0:
+def _scaled(color: ShadingValue, weight: ShadingValue) -> ShadingValue:
+    if weight.mapping is None and not weight.primvars and weight.mean[0] == 1.0:
         return color
     return combine("scaled", np.multiply, color, weight)
 
 
-def _metal(inputs: _Inputs, metallic: Signal, albedo: Signal) -> Signal:
+def _metal(inputs: _Inputs, metallic: ShadingValue, albedo: ShadingValue) -> ShadingValue:
     """The albedo of a surface that may be a metal, of which only its base colour is left, or nothing."""
     if metallic.pixels.max() <= 0.0 and not metallic.primvars:
         return albedo
@@ -290,7 +294,7 @@ def _metal(inputs: _Inputs, metallic: Signal, albedo: Signal) -> Signal:
     return combine("metal", lambda a, m: a * (1.0 - np.clip(m, 0.0, 1.0)), albedo, metallic)
 
 
-def _scattering(inputs: _Inputs, weight: str, metalness: str, default: Color, albedo: Signal) -> Signal:
+def _scattering(inputs: _Inputs, weight: str, metalness: str, default: Color, albedo: ShadingValue) -> ShadingValue:
     """The albedo of a surface of which a part scatters light below it: as reflected from its colour, where it entered.
 
     Metals let no light in.
@@ -308,7 +312,7 @@ def _scattering(inputs: _Inputs, weight: str, metalness: str, default: Color, al
     return combine("subsurface", mixed, albedo, color, share, inputs.grey(metalness, 0.0))
 
 
-def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
+def _coated(inputs: _Inputs, weight: str, albedo: ShadingValue) -> ShadingValue:
     """The albedo below a coat, whose colour filters what comes back: lacquered metals get theirs from it."""
     coat = inputs.grey(weight, 0.0)
     if coat.pixels.max() <= 0.0 and not coat.primvars:
@@ -320,7 +324,12 @@ def _coated(inputs: _Inputs, weight: str, albedo: Signal) -> Signal:
 
 
 def _surface(
-    inputs: _Inputs, albedo: Signal, emission: Signal, opacity: Signal, threshold: float, normal: Signal | None
+    inputs: _Inputs,
+    albedo: ShadingValue,
+    emission: ShadingValue,
+    opacity: ShadingValue,
+    threshold: float,
+    normal: ShadingValue | None,
 ) -> Surface | None:
     """A record with an albedo that conserves energy and an emission that exists; None if nothing is there."""
     if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
@@ -334,7 +343,7 @@ def _surface(
         emission = combine("positive", lambda e: np.clip(e, 0.0, math.inf), emission)
     opacity = combine("clip", _unit, opacity)
     values = opacity.pixels.reshape(-1)
-    if opacity.place is not None and Wrap.BLACK in opacity.place.wrap:
+    if opacity.mapping is not None and Wrap.BLACK in opacity.mapping.wrap:
         values = np.append(values, opacity.outside)
     if threshold > 0.0:
         values = (values >= threshold).astype(np.float64)
@@ -345,15 +354,15 @@ def _surface(
         inputs.warn("partial opacity lets a share of the light through, straight on ({n} materials)")
     inputs.unread("displacement")
     network = inputs.network
-    textured = opacity.place is not None and not opaque
+    textured = opacity.mapping is not None and not opaque
     material = Material(
         str(network.material),
         _rgb(albedo.mean),
         _rgb(emission.mean),
         1.0 if opaque else float(opacity.mean[0]),
         min(threshold, 1.0) if textured else 0.0,
-        None if albedo.place is None else network.texture(_bounded(albedo)),
-        None if emission.place is None or emission.pixels.max() == 0.0 else network.texture(_bounded(emission)),
+        None if albedo.mapping is None else network.texture(_bounded(albedo)),
+        None if emission.mapping is None or emission.pixels.max() == 0.0 else network.texture(_bounded(emission)),
         network.texture(_bounded(opacity)) if textured else None,
         normal_texture=None if normal is None else network.texture(normal),
     )
@@ -361,10 +370,12 @@ def _surface(
     return Surface(material, albedo_of, emission_of, opacity_of, threshold)
 
 
-def _bounded(signal: Signal) -> Signal:
+def _bounded(signal: ShadingValue) -> ShadingValue:
     """The signal, its value outside as positive as its pixels."""
     top = max(float(signal.pixels.max()), 0.0)
-    return Signal(signal.pixels, np.clip(signal.outside, 0.0, max(top, 1.0)), signal.place, signal.key, signal.name)
+    return ShadingValue(
+        signal.pixels, np.clip(signal.outside, 0.0, max(top, 1.0)), signal.mapping, signal.key, signal.name
+    )
 
 
 def _rgb(channels: Floats) -> Color:
@@ -372,7 +383,7 @@ def _rgb(channels: Floats) -> Color:
     return red, green, blue
 
 
-def _numbers(signal: Signal) -> str:
-    if signal.place is not None:
+def _numbers(signal: ShadingValue) -> str:
+    if signal.mapping is not None:
         return f"of {signal.name}"
     return "(" + ", ".join(f"{c:g}" for c in signal.mean) + ")"

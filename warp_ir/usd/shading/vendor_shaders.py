@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, UsdLux, UsdShade
 
 from warp_ir.scene import Color, Floats
-from warp_ir.usd.images.shading_value import Signal, as_color, combine, constant
+from warp_ir.usd.images.shading_value import ShadingValue, as_color, combine, constant
 from warp_ir.usd.shading.mdl import Call, read_call
 
 _BLACK: Color = (0.0, 0.0, 0.0)
@@ -29,10 +29,10 @@ class Inputs(Protocol):
     def has(self, name: str) -> bool:
         """Whether an input has a value or a connection."""
 
-    def color(self, name: str, default: Color) -> Signal:
+    def color(self, name: str, default: Color) -> ShadingValue:
         """A colour."""
 
-    def grey(self, name: str, default: float) -> Signal:
+    def grey(self, name: str, default: float) -> ShadingValue:
         """One channel."""
 
     def number(self, name: str, default: float) -> float:
@@ -44,10 +44,14 @@ class Inputs(Protocol):
     def word(self, name: str) -> str:
         """A token; a number in digits."""
 
-    def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
+    def picture(
+        self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool
+    ) -> ShadingValue | None:
         """The image that an input names; None where it names none."""
 
-    def file(self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats) -> Signal | None:
+    def file(
+        self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats
+    ) -> ShadingValue | None:
         """An image; None where it cannot be read."""
 
     def warn(self, what: str) -> None:
@@ -72,11 +76,11 @@ class _Called:
     def has(self, name: str) -> bool:
         return self._inputs.has(name) or name in {**self._call.numbers, **self._call.files, **self._call.words}
 
-    def color(self, name: str, default: Color) -> Signal:
+    def color(self, name: str, default: Color) -> ShadingValue:
         found = self._numbers(name)
         return self._inputs.color(name, default) if found is None else as_color(constant(*found))
 
-    def grey(self, name: str, default: float) -> Signal:
+    def grey(self, name: str, default: float) -> ShadingValue:
         found = self._numbers(name)
         return self._inputs.grey(name, default) if found is None else constant(found[0])
 
@@ -91,7 +95,9 @@ class _Called:
     def word(self, name: str) -> str:
         return self._inputs.word(name) or self._call.words.get(name, "")
 
-    def picture(self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool) -> Signal | None:
+    def picture(
+        self, name: str, channels: list[int], uv: str, transform: Floats, *, color: bool
+    ) -> ShadingValue | None:
         if self._inputs.has(name) or name not in self._call.files:
             return self._inputs.picture(name, channels, uv, transform, color=color)
         asset, space = self._call.files[name]
@@ -102,14 +108,14 @@ class _Called:
 class Terms:
     """What a shader says of a surface."""
 
-    albedo: Signal
+    albedo: ShadingValue
     """Of its base, metals included."""
-    metallic: Signal
-    emission: Signal
+    metallic: ShadingValue
+    emission: ShadingValue
     """Radiance."""
-    opacity: Signal
+    opacity: ShadingValue
     threshold: float = 0.0
-    normal: Signal | None = None
+    normal: ShadingValue | None = None
     """In tangent space, before it is normalised."""
 
 
@@ -161,7 +167,7 @@ def _omni_pbr(inputs: Inputs) -> Terms:
     """OmniPBR: an albedo map takes the place of the constant; brightness and the like are of the map."""
     uv, turn, projected = _omni_coordinates(inputs)
 
-    def picture(name: str, channels: list[int], *, color: bool) -> Signal | None:
+    def picture(name: str, channels: list[int], *, color: bool) -> ShadingValue | None:
         found = inputs.picture(name, channels, uv, turn, color=color)
         if found is None or not projected:
             return found
@@ -296,7 +302,7 @@ def _by_names(inputs: Inputs) -> Terms | None:
     )
 
 
-def _first(inputs: Inputs, rows: tuple[tuple[str, str, float], ...], unknown: Color) -> Signal | None:
+def _first(inputs: Inputs, rows: tuple[tuple[str, str, float], ...], unknown: Color) -> ShadingValue | None:
     """The first that there is, times its weight; `unknown` where what feeds it is not understood."""
     for color, weight, default in rows:
         if inputs.has(color):
@@ -305,5 +311,5 @@ def _first(inputs: Inputs, rows: tuple[tuple[str, str, float], ...], unknown: Co
     return None
 
 
-def _times(signal: Signal, factor: float) -> Signal:
+def _times(signal: ShadingValue, factor: float) -> ShadingValue:
     return combine(("times", factor), lambda a: a * factor, signal)

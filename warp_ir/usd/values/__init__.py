@@ -1,1 +1,1 @@
-"""What the rest reads with: checked values of attributes, primvars, triangles, and the report of what was skipped."""
+"""Basic readers of USD values: type-checked attributes, colour spaces, primvars, triangles, and the warning report."""

@@ -1,6 +1,6 @@
-"""Typed attribute values: USD hands out whatever a file holds, whatever the schema says."""
+"""Type-checked attribute values: USD returns whatever type a file authors, even if the schema says otherwise."""
 
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdShade
@@ -10,18 +10,19 @@ from warp_ir.usd.values.report import Unreadable
 from warp_ir.usd.values.source_color_space import color_space, to_rec709
 
 
-def raw(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
-    """The value as USD gives it, None where there is none or where USD itself fails to read it."""
+def raw(attribute: Usd.Attribute, time: Usd.TimeCode) -> object:
+    """The unchecked value; None if there is none, or if USD fails to read it."""
     if not attribute:
         return None
     try:
-        return attribute.Get(time)
+        value: object = attribute.Get(time)
+        return value
     except Tf.ErrorException:
         return None
 
 
 def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats | None:
-    """An array of vectors, float64 [n, columns]; None where nothing is authored.
+    """An array of vectors, float64 [n, columns]; None if it has no value.
 
     Raises:
         Unreadable: The value is of another type.
@@ -30,7 +31,7 @@ def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats
 
 
 def scalars(attribute: Usd.Attribute, time: Usd.TimeCode) -> Floats | None:
-    """An array of numbers, float64 [n]; None where nothing is authored.
+    """An array of numbers, float64 [n]; None if it has no value.
 
     Raises:
         Unreadable: The value is of another type.
@@ -49,7 +50,7 @@ def _numbers(attribute: Usd.Attribute, time: Usd.TimeCode, row: tuple[int, ...],
 
 
 def ints(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int = 1) -> Ints | None:
-    """An array of integers, int64 [n] or [n, columns]; None where nothing is authored.
+    """An array of integers, int64 [n] or [n, columns]; None if it has no value.
 
     Raises:
         Unreadable: The value is of another type.
@@ -59,17 +60,17 @@ def ints(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int = 1) -> Ints
         return None
     array = np.asarray(value)
     if columns > 1 and array.ndim == 1 and array.size % columns == 0:
-        array = array.reshape(-1, columns)  # int[] where the schema says int3[] or int4[] means the same
+        array = array.reshape(-1, columns)  # files author int[] where the schema says int3[] or int4[]
     if array.shape[1:] != ((columns,) if columns > 1 else ()) or array.ndim == 0 or array.dtype.kind not in "iu":
         raise Unreadable(f"{attribute.GetName()} is a {type(value).__name__}, not an array of integers")
     return array.astype(np.int64)
 
 
 def check_range(indices: Ints, count: int, name: str) -> None:
-    """See that indices, of points of which there are `count`, exist.
+    """Check that the indices of an attribute `name` are in [0, count).
 
     Raises:
-        Unreadable: They do not; `name` is what holds them.
+        Unreadable: An index is out of range.
     """
     if indices.size and (indices.min() < 0 or indices.max() >= count):
         worst = indices.min() if indices.min() < 0 else indices.max()
@@ -77,10 +78,10 @@ def check_range(indices: Ints, count: int, name: str) -> None:
 
 
 def number(attribute: Usd.Attribute, time: Usd.TimeCode, default: float) -> float:
-    """A finite number; the default where nothing is authored.
+    """A finite number; the default if it has no value.
 
     Raises:
-        Unreadable: The value is not a number, or not finite.
+        Unreadable: The value is no number, or not finite.
     """
     value = raw(attribute, time)
     if value is None:
@@ -91,22 +92,22 @@ def number(attribute: Usd.Attribute, time: Usd.TimeCode, default: float) -> floa
 
 
 def flag(attribute: Usd.Attribute, time: Usd.TimeCode, default: bool = False) -> bool:
-    """A truth value; the default where it is absent or something else."""
+    """A boolean; the default if it has no value or one of another type."""
     value = raw(attribute, time)
     return bool(value) if isinstance(value, bool | int) else default
 
 
 def text(attribute: Usd.Attribute, time: Usd.TimeCode, default: str = "") -> str:
-    """A token or string; the default where it is absent or something else."""
+    """A token or string; the default if it has no value or one of another type."""
     value = raw(attribute, time)
     return value if isinstance(value, str) else default
 
 
 def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color:
-    """A linear Rec.709 colour; the default where nothing is authored.
+    """A colour in linear Rec. 709; the default if it has no value.
 
     Raises:
-        Unreadable: The value is not three finite numbers.
+        Unreadable: The value is not three finite numbers, or its colour space is unknown.
     """
     value = raw(attribute, time)
     if value is None:
@@ -119,18 +120,22 @@ def color(attribute: Usd.Attribute, time: Usd.TimeCode, default: Color) -> Color
 
 
 def to_linear_rec709(attribute: Usd.Attribute, colors: Floats) -> Floats:
-    """Colours [n, 3] of an attribute, taken from its colour space (its own, its prim's or an ancestor's)."""
+    """Colours [n, 3] converted from the colour space of their attribute (`color_space_name`) to linear Rec. 709.
+
+    Raises:
+        Unreadable: The colour space is unknown.
+    """
     try:
         return to_rec709(colors, color_space(color_space_name(attribute)))
-    except Unreadable as trouble:
-        defined = Usd.ColorSpaceAPI.ComputeColorSpace(attribute, None)  # by a prim above
+    except Unreadable as error:
+        defined = Usd.ColorSpaceAPI.ComputeColorSpace(attribute, None)  # by a ColorSpaceDefinitionAPI of an ancestor
         if not defined.GetName():
-            raise Unreadable(f"{attribute.GetName()} has the {trouble}") from None
+            raise Unreadable(f"{attribute.GetName()} has the {error}") from None
         return to_rec709(colors, defined)
 
 
 def color_space_name(attribute: Usd.Attribute) -> str:
-    """The colour space of an attribute, else of its prim or the nearest above that has one, known or not; else ""."""
+    """Name, known or not, of an attribute's colour space: its own, else its prim's or nearest ancestor's, else ""."""
     name, prim = str(attribute.GetColorSpace() or ""), attribute.GetPrim()
     while not name and not prim.IsPseudoRoot():
         if prim.HasAPI(Usd.ColorSpaceAPI):
@@ -140,12 +145,12 @@ def color_space_name(attribute: Usd.Attribute) -> str:
 
 
 def is_color(attribute: Usd.Attribute) -> bool:
-    """Whether an attribute of three numbers holds a colour, and not a vector, which no colour space is for."""
+    """Whether an attribute of three numbers holds a colour rather than a vector, which has no colour space."""
     return bool(attribute.GetRoleName() == Sdf.ValueRoleNames.Color or attribute.HasColorSpace())
 
 
 def targets(relationship: Usd.Relationship) -> list[Sdf.Path]:
-    """What a relationship points to; nothing where it is absent, or is no relationship in the file."""
+    """Forwarded targets of a relationship; empty if it is absent or authored as something else."""
     try:
         return list(relationship.GetForwardedTargets()) if relationship else []
     except Tf.ErrorException:
@@ -153,16 +158,13 @@ def targets(relationship: Usd.Relationship) -> list[Sdf.Path]:
 
 
 def tokens(attribute: Usd.Attribute, time: Usd.TimeCode) -> list[str]:
-    """An array of tokens or strings; empty where it is absent or something else."""
+    """An array of tokens or strings; empty if it has no value or one of another type."""
     value = raw(attribute, time)
-    try:
-        return [str(token) for token in value or ()]
-    except TypeError:
-        return []
+    return [str(token) for token in value] if isinstance(value, Iterable) else []
 
 
 def producer(shader_input: UsdShade.Input) -> Usd.Attribute | None:
-    """The attribute an input's value comes from, through the interfaces of node graphs and materials."""
+    """The value-producing attribute of a shader input, followed through interfaces of node graphs and materials."""
     if not shader_input:
         return None
     attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input)
@@ -170,6 +172,6 @@ def producer(shader_input: UsdShade.Input) -> Usd.Attribute | None:
 
 
 def short(value: object) -> str:
-    """A value for a message of one line."""
-    words = " ".join(str(value).split())
-    return words if len(words) <= 40 else words[:37] + "…"
+    """A value as text for a one-line message, shortened to 40 characters."""
+    line = " ".join(str(value).split())
+    return line if len(line) <= 40 else line[:37] + "…"

@@ -1,4 +1,4 @@
-"""Colour spaces by the names that files give them: USD's, and those of MaterialX and of other renderers."""
+"""Colour spaces by name (USD's, MaterialX's and those of other renderers), and conversion to linear Rec. 709."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from warp_ir.usd.values.report import Unreadable
 
 _NAMES = Gf.ColorSpaceNames
 _REC709 = Gf.ColorSpace(_NAMES.LinearRec709)
-_OTHER_NAMES = {
+_ALIASES = {
     **{name.lower(): getattr(_NAMES, name) for name in dir(_NAMES) if not name.startswith("_")},
     **dict.fromkeys(("srgb", "srgb_texture", "srgb_tx", "srgb_rec709"), _NAMES.SRGBRec709),
     **dict.fromkeys(("acescg", "lin_ap1", "aces - acescg"), _NAMES.LinearAP1),
@@ -28,19 +28,19 @@ _OTHER_NAMES = {
     **dict.fromkeys(("g22_rec709", "gamma22"), _NAMES.G22Rec709),
     **dict.fromkeys(("g24_rec709", "gamma24"), _NAMES.G24Rec709),
 }
-"""In lower case."""
-_AS_IS = {"", "auto", "none", _NAMES.Data, _NAMES.Raw, _NAMES.Unknown, _NAMES.Identity, "non-color"}
-"""Where numbers are used as they are."""
+"""USD's name of each colour space by its other names, in lower case."""
+_NOT_CONVERTED = {"", "auto", "none", _NAMES.Data, _NAMES.Raw, _NAMES.Unknown, _NAMES.Identity, "non-color"}
+"""Names of values that are no colours, or of unknown colour space: they are used unconverted."""
 
 
 def color_space(name: str) -> Gf.ColorSpace | None:
-    """The colour space that a name means; None: linear Rec. 709, or no colour at all.
+    """The colour space of a given name; None: linear Rec. 709 or no colour, so that no conversion is needed.
 
     Raises:
-        Unreadable: It is no name of a colour space.
+        Unreadable: There is no colour space of that name.
     """
-    name = _OTHER_NAMES.get(name.lower(), name)
-    if name.lower() in _AS_IS or name == _NAMES.LinearRec709:
+    name = _ALIASES.get(name.lower(), name)
+    if name.lower() in _NOT_CONVERTED or name == _NAMES.LinearRec709:
         return None
     if not Gf.ColorSpace.IsValid(name):
         raise Unreadable(f"unknown colour space '{name}'")
@@ -48,7 +48,7 @@ def color_space(name: str) -> Gf.ColorSpace | None:
 
 
 def decoder(space: Gf.ColorSpace) -> Callable[[Floats], Floats] | None:
-    """What makes values of a colour space linear; None if they are."""
+    """The decoding transfer function of a colour space, encoded values to linear ones; None if it is linear."""
     gamma, bias = float(space.GetGamma()), float(space.GetLinearBias())
     if gamma == 1.0:
         return None
@@ -58,13 +58,13 @@ def decoder(space: Gf.ColorSpace) -> Callable[[Floats], Floats] | None:
 
 
 def srgb_to_linear(values: Floats) -> Floats:
-    """The inverse of sRGB's transfer function; values above 1 continue it."""
+    """The inverse of sRGB's transfer function (IEC 61966-2-1), continued above 1."""
     low = values <= 0.04045
     return np.where(low, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-def between(source: Gf.ColorSpace | None, target: Gf.ColorSpace | None) -> Floats:
-    """What takes linear colours of one space to another, float64 [3, 3], to be multiplied by columns.
+def rgb_conversion_matrix(source: Gf.ColorSpace | None, target: Gf.ColorSpace | None) -> Floats:
+    """The matrix from linear colours of one space to those of another, float64 [3, 3], for column vectors.
 
     None stands for linear Rec. 709.
     """
@@ -76,8 +76,8 @@ def between(source: Gf.ColorSpace | None, target: Gf.ColorSpace | None) -> Float
 
 
 def to_rec709(colors: Floats, space: Gf.ColorSpace | None) -> Floats:
-    """Colours [..., 3] of a colour space in linear Rec. 709."""
+    """Colours [..., 3] of a colour space, converted to linear Rec. 709."""
     if space is None:
         return colors
     decode = decoder(space)
-    return (colors if decode is None else decode(colors)) @ between(space, None).T
+    return (colors if decode is None else decode(colors)) @ rgb_conversion_matrix(space, None).T

@@ -1,36 +1,33 @@
-"""A gprim as triangles in its own space, before it is coloured and placed in the world."""
+"""A gprim as triangles in its own space, before materials and transforms are applied."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from warp_ir.scene import Floats, Ints, instances
-
-Mask = npt.NDArray[np.bool_]
+from warp_ir.scene import Bools, Floats, Ints, instances
 
 
-class Refined(Protocol):
-    """How primvars follow a surface that was subdivided: values of the prim's elements to those of the finer mesh."""
+class PrimvarRefiner(Protocol):
+    """Interpolation of primvars over a subdivided surface: from the prim's elements to those of the refined mesh."""
 
     def vertex(self, values: Floats) -> Floats:
-        """Values of points [n, c] at the refined points."""
+        """Values of points [n, c] at the refined points, by the smooth rules of the subdivision scheme."""
 
     def varying(self, values: Floats) -> Floats:
-        """Values of points [n, c] at the refined points, linear on every face."""
+        """Values of points [n, c] at the refined points, interpolated linearly over every face."""
 
     def face_varying(self, values: Floats, indices: Ints | None = None) -> Floats:
         """Values of face-vertices [v, c], or [n, c] with indices [v], at the refined face-vertices."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
-    """Triangles that still know which face and which face-vertex of the prim they came from.
+class TriangleMesh:
+    """Triangles of a gprim that know the face and the face-vertices of the prim that they were made of.
 
-    Of a subdivided surface, points, triangles and corners are those of the finer mesh, faces those of the prim. A
-    native prototype is read into one `Shape`, however often it is placed.
+    For a subdivided surface, points, triangles and corners are those of the refined mesh, faces those of the prim. The
+    prims of a native prototype are read once, whatever the number of instances.
     """
 
     points: Floats
@@ -38,20 +35,20 @@ class Shape:
     triangles: Ints
     """int32 [m, 3], counter-clockwise seen from the front."""
     face: Ints
-    """int32 [m]: the prim's face each triangle is part of."""
+    """int32 [m], index of the prim's face of which each triangle is part."""
     corner: Ints
-    """int32 [m, 3]: the prim's face-vertex each corner is."""
+    """int32 [m, 3], index of the prim's (or the refined mesh's) face-vertex at each corner."""
     normals: Floats | None = None
-    """float32 [m, 3, 3], unit shading normals; None: faceted."""
-    elements: Mapping[str, int] = field(default_factory=dict)
-    """How many values a primvar has per interpolation; an interpolation that is missing cannot be honoured."""
-    degenerate: int = 0
-    """Number of faces without area that were left out."""
-    refined: Refined | None = None
-    """How primvars get from the prim's elements to those of a subdivided surface; None: they are the same."""
+    """float32 [m, 3, 3], unit shading normals; None: the geometric normals."""
+    element_counts: Mapping[str, int] = field(default_factory=dict)
+    """Number of values of a primvar per interpolation; interpolations that are missing cannot be honoured."""
+    degenerate_faces: int = 0
+    """Number of faces without area that were dropped."""
+    refiner: PrimvarRefiner | None = None
+    """Interpolates primvars over a subdivided surface; None: the surface is not subdivided."""
 
-    def keep(self, mask: Mask) -> "Shape":
-        """This shape with only the triangles that the mask [m] selects."""
+    def keep(self, mask: Bools) -> "TriangleMesh":
+        """This mesh with only the triangles that the mask [m] selects."""
         normals = None if self.normals is None else self.normals[mask]
         return replace(
             self,
@@ -63,42 +60,45 @@ class Shape:
 
 
 def cross_products(points: Floats, triangles: Ints) -> Floats:
-    """Twice the area of each triangle, as a vector along its geometric normal, float64 [m, 3]."""
+    """Cross products of the triangles' edges, float64 [m, 3]: geometric normals of twice the area as length."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
 
-def without_slivers(shape: Shape) -> Shape:
-    """The shape without triangles that have no area (to float64, relative to their longest edge)."""
-    a, b, c = (shape.points[shape.triangles[:, k]] for k in range(3))
+def drop_degenerate(mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh without triangles whose doubled area is at most 1e-10 times the square of their longest edge."""
+    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
     ab, ac, bc = b - a, c - a, c - b
-    longest = np.maximum(np.maximum(_squared(ab), _squared(ac)), _squared(bc))
-    fine = _squared(np.cross(ab, ac)) > (1e-10 * longest) ** 2
-    return shape if fine.all() else shape.keep(fine)
+    longest = np.maximum(np.maximum(_squared_lengths(ab), _squared_lengths(ac)), _squared_lengths(bc))
+    valid = _squared_lengths(np.cross(ab, ac)) > (1e-10 * longest) ** 2
+    return mesh if valid.all() else mesh.keep(valid)
 
 
-def elements_of(points: Floats, counts: Ints, indices: Ints) -> dict[str, int]:
-    """`Shape.elements` of a polygon mesh."""
+def count_elements(points: Floats, counts: Ints, indices: Ints) -> dict[str, int]:
+    """`TriangleMesh.element_counts` of a polygon mesh."""
     return {"uniform": len(counts), "vertex": len(points), "varying": len(points), "faceVarying": len(indices)}
 
 
-def shaded(shape: Shape, normals: Floats) -> Shape:
-    """The shape with these normals [m, 3, 3], its own where they are unusable; faceted if they say no more."""
-    geometric = cross_products(shape.points, shape.triangles)
+def with_normals(mesh: TriangleMesh, normals: Floats) -> TriangleMesh:
+    """The mesh with shading normals [m, 3, 3], normalized here; unusable ones are replaced by the geometric normal.
+
+    A mesh stays faceted if all given normals equal the geometric ones.
+    """
+    geometric = cross_products(mesh.points, mesh.triangles)
     geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     usable = np.isfinite(length) & (length > 1e-12)
     normals = np.where(usable, normals / np.where(usable, length, 1.0), geometric[:, None])
     if (np.einsum("mci,mi->mc", normals, geometric) > 1.0 - 1e-6).all():
-        return shape
-    return replace(shape, normals=normals.astype(np.float32))
+        return mesh
+    return replace(mesh, normals=normals.astype(np.float32))
 
 
-def place(shape: Shape, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
-    """Copies of a shape's points, triangles and normals: see `scene.instances.place`."""
-    return instances.place(shape.points, shape.triangles, shape.normals, matrices)
+def instantiate(mesh: TriangleMesh, matrices: Floats) -> tuple[Floats, Ints, Floats | None]:
+    """Points, triangles and normals of a mesh's copies under matrices; see `scene.instances.transform_copies`."""
+    return instances.transform_copies(mesh.points, mesh.triangles, mesh.normals, matrices)
 
 
-def _squared(vectors: Floats) -> Floats:
+def _squared_lengths(vectors: Floats) -> Floats:
     squares: Floats = np.einsum("ij,ij->i", vectors, vectors)
     return squares
