@@ -169,7 +169,7 @@ def test_the_colour_space_of_a_document(looks):
 def test_what_others_share_is_left_alone(looks):
     """Layers on the disk, and those that the process has open, are as they were."""
     (looks / "stage.usda").write_text("#usda 1.0\n" + ROOT + mesh())
-    theirs = Sdf.IrradianceLayer.FindOrOpen(str(looks / "stage.usda"))
+    theirs = Sdf.Layer.FindOrOpen(str(looks / "stage.usda"))
     before = theirs.ExportToString()
     ir.load_usd(looks / "stage.usda")
     assert theirs.ExportToString() == before and not theirs.dirty
@@ -210,7 +210,7 @@ BAD = {
     "document type": '<!DOCTYPE x [<!ENTITY a "b">]><materialx version="1.38"/>',
     "no MaterialX": "<usd/>",
     "bytes; the limit": "<materialx>" + " " * 2**24 + "</materialx>",
-    "includes are not read": DOCUMENT.replace("<nodegraph", '<xi:include href="b.mtlx"/><nodegraph', 1),
+    "included documents are not read": DOCUMENT.replace("<nodegraph", '<xi:include href="b.mtlx"/><nodegraph', 1),
     "which is not there": DOCUMENT.replace('nodename="half"', 'nodename="nobody"'),
 }
 
