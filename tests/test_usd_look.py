@@ -716,3 +716,43 @@ def test_absurd_numbers_render(tmp_path, image, inputs):
     scene = load(tmp_path, textured(inputs) + mesh())
     settings = ir.RenderSettings(width=4, height=4, iterations=1, light_paths=16)
     assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()
+
+
+def test_a_subset_that_reads_primvars_leaves_the_other_faces_unbound(tmp_path):
+    """The only material belongs to one face and reads a primvar; the other face has neither material nor colour."""
+    subset = """    def GeomSubset "Part" (prepend apiSchemas = ["MaterialBindingAPI"])
+    {
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [0]
+        rel material:binding = </A>
+    }
+"""
+    mesh_text = f"""def Mesh "M"
+{{
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3, 3]
+    int[] faceVertexIndices = [0, 1, 2, 0, 2, 3]
+    color3f[] primvars:tint = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)] (interpolation = "vertex")
+{subset}}}
+"""
+    reader = """def Material "A"
+{
+    token outputs:surface.connect = </A/S.outputs:surface>
+    def Shader "S"
+    {
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </A/R.outputs:result>
+        token outputs:surface
+    }
+    def Shader "R"
+    {
+        uniform token info:id = "UsdPrimvarReader_float3"
+        string inputs:varname = "tint"
+        float3 outputs:result
+    }
+}
+"""
+    mesh_read = load(tmp_path, reader + mesh_text).meshes[0]
+    np.testing.assert_allclose(mesh_read.colors[0], np.eye(3))
+    np.testing.assert_allclose(mesh_read.colors[1], 0.18)

@@ -265,7 +265,7 @@ class MaterialTable:
     def albedo(self, index: Ints) -> Floats:
         """Albedos of materials by index [m], float32 [m, 3]; negative indices get an arbitrary one."""
         table: Floats = np.array([m.albedo for m in self.materials], dtype=np.float32)
-        return table[index]
+        return table[np.maximum(index, 0)]
 
     def _subsets(self, prim: Usd.Prim, shape: Shape) -> list[tuple[Mask, int]]:
         """Face masks, bool [faces], with the material bound to them; the first subset of a face wins."""
