@@ -335,7 +335,7 @@ def test_no_blur_without_motion_or_shutter(tmp_path):
     ):
         assert ir.load_usd(write(tmp_path, *parts)).shutter == ()
     scene = ir.load_usd(write(tmp_path, CAMERA % (1, 0.5, AT_4), moving))
-    assert scene.shutter == () and any("/C" in line and "before it opens" in line for line in scene.warnings)
+    assert scene.shutter == () and any("/C" in line and "is before shutter:open" in line for line in scene.warnings)
 
 
 def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):
@@ -343,11 +343,13 @@ def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):
     camera, moving = CAMERA % (0, 0.5, AT_4), moves("1: (0, 0, 0), 2: (1, 0, 0)")
     still = "".join(quad(f"S{k}") for k in range(20))
     few = write(tmp_path, camera, quad("Q", moving), still)
-    monkeypatch.setattr("warp_ir.usd.load._SLICED_TRIANGLES", 2 * MOMENTS)
+    monkeypatch.setattr("warp_ir.usd.load._MAX_SHUTTER_TRIANGLES", 2 * MOMENTS)
     scene = ir.load_usd(few)
-    assert len(scene.shutter) == MOMENTS and not any("moments" in line for line in scene.warnings)
+    assert len(scene.shutter) == MOMENTS and not any("shutter samples" in line for line in scene.warnings)
     scene = ir.load_usd(write(tmp_path, camera, quad("Q", moving), quad("R", moving), still))
-    assert len(scene.shutter) == MOMENTS // 2 and any("/C" in line and "8 moments" in line for line in scene.warnings)
+    assert len(scene.shutter) == MOMENTS // 2 and any(
+        "/C" in line and "8 shutter samples" in line for line in scene.warnings
+    )
 
 
 def test_blur_is_not_filtered_away():

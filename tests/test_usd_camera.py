@@ -101,10 +101,10 @@ def test_clipping_planes(tmp_path):
     scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 1, 2), (1, 0, 0, -3)]"))
     assert scene.camera.clipping_planes == ((0.0, 0.0, 1.0, 2.0), (1.0, 0.0, 0.0, -3.0)) and not warned(scene, "/C")
     scene = load(tmp_path, camera_text("float4[] clippingPlanes = [(0, 0, 0, 2), (nan, 0, 0, 1)]"))
-    assert scene.camera.clipping_planes == () and warned(scene, "/C", "clippingPlanes: 2 that are no planes")
+    assert scene.camera.clipping_planes == () and warned(scene, "/C", "clippingPlanes: 2 invalid planes")
     planes = ", ".join(["(1, 0, 0, 5)"] * 7)
     scene = load(tmp_path, camera_text(f"float4[] clippingPlanes = [{planes}]"))
-    assert len(scene.camera.clipping_planes) == 6 and warned(scene, "/C", "of 7 the first 6")
+    assert len(scene.camera.clipping_planes) == 6 and warned(scene, "/C", "only the first 6 of 7")
     scene = load(tmp_path, camera_text("int[] clippingPlanes = [1, 2]"))
     assert scene.camera.clipping_planes == () and warned(scene, "/C", "clippingPlanes")
 
@@ -183,7 +183,7 @@ def Cube "B" {{
 @pytest.mark.parametrize("wrong", [{"camera": "C", "eye": (1, 2, 3)}, {"look_at": (0, 0, 0)}])
 def test_an_eye_alone_is_a_camera(tmp_path, wrong):
     """Either a camera of the stage or an eye; what is to be looked at belongs to the latter."""
-    with pytest.raises(InputError, match="eye: it stands in place of a camera"):
+    with pytest.raises(InputError, match="eye: it replaces camera"):
         load(tmp_path, 'def Camera "C" {}', **wrong)
 
 

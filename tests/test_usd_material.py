@@ -197,7 +197,7 @@ def test_inline_materialx(tmp_path, shader, inputs, albedo, emission):
         (material_text(output="ri:surface", shader="PxrVolume"), "PxrVolume"),
         (material_text(output="ri:surface").replace("def Shader", "def NodeGraph"), "outputs:ri:surface"),
         ('def Material "A" {\n}\n', "no surface shader"),
-        ("", "/A, does not exist"),
+        ("", "/A does not exist"),
     ],
 )
 def test_a_material_that_cannot_be_read_leaves_the_display_colour(tmp_path, text, word):

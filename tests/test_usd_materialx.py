@@ -210,7 +210,7 @@ BAD = {
     "document type": '<!DOCTYPE x [<!ENTITY a "b">]><materialx version="1.38"/>',
     "no MaterialX": "<usd/>",
     "bytes; the limit": "<materialx>" + " " * 2**24 + "</materialx>",
-    "includes are not read": DOCUMENT.replace("<nodegraph", '<xi:include href="b.mtlx"/><nodegraph', 1),
+    "included documents are not read": DOCUMENT.replace("<nodegraph", '<xi:include href="b.mtlx"/><nodegraph', 1),
     "which is not there": DOCUMENT.replace('nodename="half"', 'nodename="nobody"'),
 }
 

@@ -99,7 +99,7 @@ def test_types_of_other_programs_are_named_in_one_line(tmp_path):
         f'def OtherSky "S" {{\n}}\ndef OtherGroup "G" {{\n def Mesh "M" {{{TRIANGLE}}}\n}}\ndef OtherSky "T" {{\n}}'
     )
     scene = load(tmp_path, foreign + '\ndef HoudiniLayerInfo "H" {\n}')
-    told = "/S, /G, /T: not rendered, for USD has no such types: OtherSky, OtherGroup"
+    told = "/S, /G, /T: not rendered: prim types unknown to USD: OtherSky, OtherGroup"
     assert [line for line in scene.warnings if "types" in line] == [told]
     assert [mesh.name for mesh in scene.meshes] == ["/G/M"]
     scene = load(tmp_path, '(fallbackPrimTypes = { token[] OtherSky = ["DomeLight"] })\ndef OtherSky "S" {\n}')

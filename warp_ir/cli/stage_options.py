@@ -57,11 +57,11 @@ def stage_facts(reader: "StageReader", time: TimeCode = None) -> dict[str, Any]:
 
     from warp_ir.usd.camera_prim import all_cameras
     from warp_ir.usd.settings.render_spec import render_settings_prims
-    from warp_ir.usd.stage.open import quiet, time_code, up_axis
+    from warp_ir.usd.stage.open import quiet_diagnostics, time_code, up_axis
     from warp_ir.usd.values.report import Report
 
     stage = reader.stage
-    with quiet():
+    with quiet_diagnostics():
         spec = reader.spec(time)
         code = time_code(stage, time)
         frames = [stage.GetStartTimeCode(), stage.GetEndTimeCode()] if stage.HasAuthoredTimeCodeRange() else None

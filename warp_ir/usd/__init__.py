@@ -1,7 +1,8 @@
-"""USD stages to `Scene` records: the only package that imports pxr.
+"""USD stages as `Scene` records: the only package that imports pxr.
 
-Reading order: `load` (the whole on one page), `walk` (what is drawn, and where), `mesh` and `implicit` (triangles),
-`material` and `surface` (what they look like), `light`, `camera`. Whatever cannot be honoured goes to `report`.
+Reading order: `load` (the whole on one page), `traverse` (which prims are drawn, with which transforms), `assemble`
+(gprims to meshes), then the families: `geometry`, `shading`, `lights`, `settings`, `stage`, and below them `values` and
+`images`. What cannot be honoured goes to `values.report`.
 """
 
 from warp_ir.usd.load import StageReader, load_usd

@@ -1,4 +1,4 @@
-"""Gprims to meshes: each shape read once, given its look, and placed wherever it is drawn, or kept as a prototype."""
+"""Gprims to meshes: each shape is read once, gets its materials, and is instanced or copied to all its transforms."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,22 +23,23 @@ from warp_ir.usd.geometry.skinning import Skinning, pose_key
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue
-from warp_ir.usd.lights.mesh_light import LAMP_UV, Lamp
-from warp_ir.usd.linking import Linking
+from warp_ir.usd.lights.mesh_light import LIGHT_UV, MeshLightPrim
+from warp_ir.usd.linking import LightLinks
 from warp_ir.usd.shading.binding import PURPOSES
-from warp_ir.usd.shading.material_table import ABSENT, Look, MaterialTable
-from warp_ir.usd.traverse import LIGHT_COPIES, Site
+from warp_ir.usd.shading.material_table import TRANSPARENT, MaterialAssignment, MaterialTable
+from warp_ir.usd.traverse import MAX_LIGHT_COPIES, DrawnPrim
 from warp_ir.usd.values import read
 from warp_ir.usd.values.primvar import texture_coordinates
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh, cross_products, drop_degenerate, instantiate
 
-_Shapes = dict[tuple[Sdf.Path, ...], TriangleMesh | None]
+ShapeCache = dict[tuple[Sdf.Path, ...], TriangleMesh | None]
+"""Shapes by prim and skinning; None: the prim cannot be read or has no triangles."""
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What a stage draws."""
+    """The geometry of a stage, as a `Scene` takes it."""
 
     meshes: tuple[Mesh, ...]
     instances: tuple[Instances, ...]
@@ -47,59 +48,59 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class _Gprim:
-    """A gprim as it was read."""
+    """A gprim that was read: its shape in its own space and its materials."""
 
-    site: Site
+    drawn: DrawnPrim
     shape: TriangleMesh
-    look: Look
+    assignment: MaterialAssignment
     emits: bool
 
 
 @dataclass(eq=False)
 class _Prototype:
-    """A prototype that is stored once, while its meshes are made."""
+    """A prototype that is stored once, while its meshes are built."""
 
     matrices: Floats
     colors: Floats | None
-    fit: Bools
-    """Which of its places can be instances; the others are written out."""
+    invertible: Bools
+    """Whether each transform can be inverted precisely enough for an instance; the others become copies."""
     meshes: list[int] = field(default_factory=list)
 
 
 def build_meshes(
-    sites: Sequence[Site],
+    gprims: Sequence[DrawnPrim],
     time: Usd.TimeCode,
     report: Report,
     levels: int = 0,
-    shapes: _Shapes | None = None,
+    shapes: ShapeCache | None = None,
     images: ImageCache | None = None,
     metals: str = "diffuse",
     purposes: Sequence[str] = PURPOSES[:2],
-    linking: Linking | None = None,
+    links: LightLinks | None = None,
 ) -> Geometry:
-    """All meshes, one per gprim with all its copies, those that are instanced, and the materials they use.
+    """Meshes of gprims (one per gprim, with all its copies), instanced prototypes, and the materials that they use.
 
     Args:
-        sites: The gprims and where they are drawn.
-        time: Of the values.
-        report: Where troubles go.
-        levels: How often subdivision surfaces are refined.
-        shapes: Those that are known already; new ones are added.
-        images: Those that are known already, likewise.
+        gprims: The gprims with their transforms.
+        time: Time code of all values.
+        report: Receives warnings and counts.
+        levels: Refinement levels of subdivision surfaces.
+        shapes: Cache of shapes; new ones are added.
+        images: Cache of images; new ones are added.
         metals: "diffuse" or "black".
-        purposes: Of the bindings of materials, in the order in which they are wanted.
-        linking: The links of lights, by which copies of a gprim may differ.
+        purposes: Purposes of material bindings, in order of preference.
+        links: Light links, by which copies of a gprim may differ.
 
     Raises:
-        InputError: There are more triangles than could be rendered.
+        InputError: There are more triangles than can be rendered.
     """
     table = MaterialTable(time, report, images, metals, purposes)
-    known = {} if shapes is None else shapes
-    return _Builder(time, report, levels, table, known, linking or Linking(())).run(sites)
+    shape_cache = {} if shapes is None else shapes
+    return _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(())).run(gprims)
 
 
-class _Builder:
-    """From gprims to meshes and the materials they use."""
+class _MeshBuilder:
+    """Builds the meshes of one time; see `build_meshes`."""
 
     def __init__(
         self,
@@ -107,178 +108,199 @@ class _Builder:
         report: Report,
         levels: int,
         table: MaterialTable,
-        shapes: _Shapes,
-        linking: Linking,
+        shapes: ShapeCache,
+        links: LightLinks,
     ) -> None:
         self._time, self._report, self._levels, self._table = time, report, levels, table
-        self._linking = linking
+        self._links = links
         self._skinning = Skinning(time, report)
         self._shapes = shapes
-        self._seen: dict[tuple[object, ...], tuple[TriangleMesh, Look, bool]] = {}
-        self._known: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
-        self._lamps: dict[Sdf.Path, Lamp] = {}
-        self._painted: dict[tuple[int, Hashable], InstanceLevel] = {}
-        self._dressed: dict[tuple[int, int], Look] = {}
+        self._gprim_cache: dict[tuple[object, ...], tuple[TriangleMesh, MaterialAssignment, bool]] = {}
+        self._placed_cache: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
+        self._mesh_lights: dict[Sdf.Path, MeshLightPrim] = {}
+        self._colored_levels: dict[tuple[int, Hashable], InstanceLevel] = {}
+        self._instance_colored: dict[tuple[int, int], MaterialAssignment] = {}
 
-    def run(self, sites: Sequence[Site]) -> Geometry:
-        self._table.resolve([site.prim for site in sites])
-        gprims = [gprim for site in sites if (gprim := self._gprim(site)) is not None]
-        parts = [InstancedGprim(g.site.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
+    def run(self, drawn_prims: Sequence[DrawnPrim]) -> Geometry:
+        """Builds all meshes and prototypes."""
+        self._table.resolve([drawn.prim for drawn in drawn_prims])
+        gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
+        parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
         meshes: list[Mesh] = []
         prototypes: dict[int, _Prototype] = {}
-        for drawn in choose_storage(parts, self._report.source):
-            gprim, home = gprims[drawn.gprim], drawn.prototype
-            places = nested_transforms(level.matrices for level in drawn.levels)
-            colors = nested_colors((len(level.matrices), level.colors) for level in drawn.levels)
-            if home is None:
-                for chosen in self._apart(gprim, places):
-                    self._add(meshes, self._mesh(gprim, places[chosen], None if colors is None else colors[chosen]))
+        for stored in choose_storage(parts, self._report.source):
+            gprim, group = gprims[stored.gprim], stored.prototype
+            matrices_in_level = nested_transforms(level.matrices for level in stored.levels)
+            colors = nested_colors((len(level.matrices), level.colors) for level in stored.levels)
+            if group is None:
+                for copies in self._split_by_light(gprim, matrices_in_level):
+                    self._add(
+                        meshes, self._mesh(gprim, matrices_in_level[copies], None if colors is None else colors[copies])
+                    )
                 continue
-            if id(home) not in prototypes:
-                prototypes[id(home)] = self._prototype(home, gprim)
-            prototype = prototypes[id(home)]
-            if prototype.fit.any():
-                mesh = self._mesh(gprim, places, colors, shared=True)
+            if id(group) not in prototypes:
+                prototypes[id(group)] = self._prototype(group, gprim)
+            prototype = prototypes[id(group)]
+            if prototype.invertible.any():
+                mesh = self._mesh(gprim, matrices_in_level, colors, shared=True)
                 if mesh is not None and (prototype.colors is None or colors is not None):
                     mesh = replace(mesh, bare=None)
                 prototype.meshes += self._add(meshes, mesh)
-            if not prototype.fit.all():
-                self._add(meshes, self._unfit(gprim, prototype, places, colors))
+            if not prototype.invertible.all():
+                self._add(meshes, self._singular_copies(gprim, prototype, matrices_in_level, colors))
         instances = [
             Instances(
                 meshes[prototype.meshes[0]].name,
                 tuple(prototype.meshes),
-                prototype.matrices[prototype.fit],
-                None if prototype.colors is None else prototype.colors[prototype.fit].astype(np.float32),
+                prototype.matrices[prototype.invertible],
+                None if prototype.colors is None else prototype.colors[prototype.invertible].astype(np.float32),
             )
             for prototype in prototypes.values()
             if prototype.meshes
         ]
-        renamed, materials = self._only_used(meshes)
-        return Geometry(renamed, tuple(instances), materials)
+        used_meshes, materials = self._without_unused_materials(meshes)
+        return Geometry(used_meshes, tuple(instances), materials)
 
     @staticmethod
     def _add(meshes: list[Mesh], mesh: Mesh | None) -> list[int]:
-        """Appends a mesh if there is one; its index."""
+        """Appends a mesh unless it is None; returns the list of its index."""
         if mesh is None:
             return []
         meshes.append(mesh)
         return [len(meshes) - 1]
 
-    def _gprim(self, site: Site) -> _Gprim | None:
-        """A gprim without the triangles that are not there; equal looks are stored once."""
-        whole = self._shape(site.prim)
-        if whole is None:
+    def _gprim(self, drawn: DrawnPrim) -> _Gprim | None:
+        """A gprim without its fully transparent triangles; equal shapes with equal materials are stored once."""
+        full = self._shape(drawn.prim)
+        if full is None:
             return None
-        look = self._table.look(site.prim, whole)
-        lamp = self._lamp(site)
-        if lamp is not None and lamp.textured and LAMP_UV not in look.uvs:
-            corners = texture_coordinates(site.prim, whole, LAMP_UV, self._time, self._report)
-            look = look if corners is None else replace(look, uvs={**look.uvs, LAMP_UV: corners})
-        uvs = tuple((name, digest(corners)) for name, corners in sorted(look.uvs.items()))
-        key = (id(whole), digest(look.material), digest(look.colors), digest(look.bare), uvs)
-        if key not in self._seen:
-            present, shape = look.material != ABSENT, whole
-            if not present.all():
-                shape, look = whole.keep(present), look.keep(present)
-            emission = [max(self._table.materials[k].emission) for k in np.unique(look.material)]
-            self._seen[key] = (shape, look, max(emission, default=0.0) > 0.0)
-        shape, look, emits = self._seen[key]
-        absent = len(whole.triangles) - len(shape.triangles)
-        self._report.stats["triangles_absent"] += absent * site.level.instance_count
+        assignment = self._table.assign(drawn.prim, full)
+        mesh_light = self._mesh_light(drawn)
+        if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
+            corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
+            assignment = (
+                assignment if corners is None else replace(assignment, uvs={**assignment.uvs, LIGHT_UV: corners})
+            )
+        uvs = tuple((name, digest(corners)) for name, corners in sorted(assignment.uvs.items()))
+        key = (id(full), digest(assignment.material), digest(assignment.colors), digest(assignment.bare), uvs)
+        if key not in self._gprim_cache:
+            opaque, shape = assignment.material != TRANSPARENT, full
+            if not opaque.all():
+                shape, assignment = full.keep(opaque), assignment.keep(opaque)
+            emission = [max(self._table.materials[k].emission) for k in np.unique(assignment.material)]
+            self._gprim_cache[key] = (shape, assignment, max(emission, default=0.0) > 0.0)
+        shape, assignment, emits = self._gprim_cache[key]
+        dropped = len(full.triangles) - len(shape.triangles)
+        self._report.stats["triangles_absent"] += dropped * drawn.level.instance_count
         if len(shape.triangles) == 0:
             return None
-        site, look = self._with_instance_primvars(site, look)
-        return _Gprim(site, shape, look, emits or lamp is not None)
+        drawn, assignment = self._with_instance_primvars(drawn, assignment)
+        return _Gprim(drawn, shape, assignment, emits or mesh_light is not None)
 
-    def _with_instance_primvars(self, site: Site, look: Look) -> tuple[Site, Look]:
-        """The gprim as its material has it, if that reads primvars which instancers give to each instance."""
-        given = [level.primvars for level in site.level.chain() if level.primvars is not None]
-        for name in sorted(name for name in look.unread if any(each.has(name) for each in given)):
-            what = f"emission or opacity by the primvar {name} of each instance is not read: its fallback counts"
-            self._report.warn(site.prim.GetPath(), what)
-        levels = [self._paint(site.level, albedo) for _, albedo in look.asked]
-        found = [k for k, level in enumerate(levels) if any(each.colors is not None for each in level.chain())]
-        if not found:
-            return site, look
-        if len(found) > 1 or look.bare is not None:
-            path = site.prim.GetPath()
-            self._report.warn(path, "of materials that read primvars of instances, one is coloured by them")
-        key = (id(look), found[0])
-        if key not in self._dressed:
-            self._dressed[key] = replace(look, bare=look.asked[found[0]][0])
-        return replace(site, level=levels[found[0]]), self._dressed[key]
+    def _with_instance_primvars(
+        self, drawn: DrawnPrim, assignment: MaterialAssignment
+    ) -> tuple[DrawnPrim, MaterialAssignment]:
+        """Evaluates materials that read primvars which point instancers give to each instance.
 
-    def _paint(self, level: InstanceLevel, albedo: ShadingValue) -> InstanceLevel:
-        """A level with the colours that an albedo has in its places, and so all levels that it is in."""
+        The colours become those of the instancing levels; emission and opacity are not evaluated per instance.
+        """
+        instance_primvars = [level.primvars for level in drawn.level.chain() if level.primvars is not None]
+        for name in sorted(
+            name for name in assignment.unread_primvars if any(primvars.has(name) for primvars in instance_primvars)
+        ):
+            what = f"emission and opacity do not vary per instance: the primvar {name} takes its fallback"
+            self._report.warn(drawn.prim.GetPath(), what)
+        levels = [self._with_primvar_colors(drawn.level, albedo) for _, albedo in assignment.primvar_albedos]
+        colored = [k for k, level in enumerate(levels) if any(outer.colors is not None for outer in level.chain())]
+        if not colored:
+            return drawn, assignment
+        if len(colored) > 1 or assignment.bare is not None:
+            path = drawn.prim.GetPath()
+            self._report.warn(path, "several of its materials read primvars of instances: only one is coloured by them")
+        key = (id(assignment), colored[0])
+        if key not in self._instance_colored:
+            self._instance_colored[key] = replace(assignment, bare=assignment.primvar_albedos[colored[0]][0])
+        return replace(drawn, level=levels[colored[0]]), self._instance_colored[key]
+
+    def _with_primvar_colors(self, level: InstanceLevel, albedo: ShadingValue) -> InstanceLevel:
+        """The level, and all levels around it, with the colours that an albedo has for each of their instances."""
         if level.parent is None:
             return level
         key = (id(level), albedo.key)
-        if key not in self._painted:
+        if key not in self._colored_levels:
             colors: Floats | None = None
             if level.primvars is not None:
-                by_name = {
-                    asked: level.primvars.read(asked.name, asked.channels, self._report) for asked in albedo.primvars
+                by_primvar = {
+                    primvar: level.primvars.read(primvar.name, primvar.channels, self._report)
+                    for primvar in albedo.primvars
                 }
-                values = {asked: rows for asked, rows in by_name.items() if rows is not None}
+                values = {primvar: rows for primvar, rows in by_primvar.items() if rows is not None}
                 if values:
                     colors = np.broadcast_to(albedo.evaluate(values), (len(level.matrices), 3)).clip(0.0, 1.0)
-            parent = self._paint(level.parent, albedo)
-            self._painted[key] = replace(level, key=(level.key, albedo.key), parent=parent, colors=colors)
-        return self._painted[key]
+            parent = self._with_primvar_colors(level.parent, albedo)
+            self._colored_levels[key] = replace(level, key=(level.key, albedo.key), parent=parent, colors=colors)
+        return self._colored_levels[key]
 
-    def _lamp(self, site: Site) -> Lamp | None:
-        """The light that a gprim is, if it is one."""
-        prim = site.prim if site.prim.HasAPI(UsdLux.LightAPI) else site.lamp
+    def _mesh_light(self, drawn: DrawnPrim) -> MeshLightPrim | None:
+        """The light that a gprim emits as: by LightAPI, or by a GeometryLight; None: it is no light."""
+        prim = drawn.prim if drawn.prim.HasAPI(UsdLux.LightAPI) else drawn.geometry_light
         if prim is None:
             return None
-        path = site.prim.GetPath()
-        if path not in self._lamps:
-            self._lamps[path] = Lamp(prim, site.prim, self._time, self._report)
-        return self._lamps[path]
+        path = drawn.prim.GetPath()
+        if path not in self._mesh_lights:
+            self._mesh_lights[path] = MeshLightPrim(prim, drawn.prim, self._time, self._report)
+        return self._mesh_lights[path]
 
-    def _apart(self, gprim: _Gprim, places: Floats) -> list[slice]:
-        """The places that one mesh can stand for: all, unless they differ as lights."""
-        lamp = self._lamp(gprim.site)
-        if lamp is None or len(places) == 1:
+    def _split_by_light(self, gprim: _Gprim, matrices_in_level: Floats) -> list[slice]:
+        """Slices of transforms that one mesh can hold: all, unless the instances differ as lights."""
+        mesh_light = self._mesh_light(gprim.drawn)
+        if mesh_light is None or len(matrices_in_level) == 1:
             return [slice(None)]
-        areas = areas_of_copies(gprim.shape.points, gprim.shape.triangles, places @ gprim.site.local)
-        if not lamp.differs(areas):
+        areas = areas_of_copies(
+            gprim.shape.points, gprim.shape.triangles, matrices_in_level @ gprim.drawn.level_from_prim
+        )
+        if not mesh_light.varies_by_instance(areas):
             return [slice(None)]
-        if len(places) > LIGHT_COPIES:
-            self._report.warn(gprim.site.prim.GetPath(), f"{len(places)} copies of a light: too many, it is left out")
+        if len(matrices_in_level) > MAX_LIGHT_COPIES:
+            self._report.warn(
+                gprim.drawn.prim.GetPath(),
+                f"{len(matrices_in_level)} instances of a light exceed the limit: it is skipped",
+            )
             return []
-        return [slice(k, k + 1) for k in range(len(places))]
+        return [slice(k, k + 1) for k in range(len(matrices_in_level))]
 
     def _signature(self, gprim: _Gprim) -> object:
-        """Equal for gprims of one prototype that look and are lit alike; shapes and looks are kept: ids will do."""
-        links = self._linking.of(gprim.site.prim.GetPath())
-        return id(gprim.shape), id(gprim.look), digest(gprim.site.local), links
+        """Equal for gprims of a prototype that look equal and are lit equally; cached objects are compared by id."""
+        links = self._links.memberships(gprim.drawn.prim.GetPath())
+        return id(gprim.shape), id(gprim.assignment), digest(gprim.drawn.level_from_prim), links
 
     def _prototype(self, group: LevelGroup, gprim: _Gprim) -> _Prototype:
+        """A prototype with the finite transforms of its instances."""
         matrices = group.world_matrices()
         finite = np.isfinite(matrices).all(axis=(1, 2))
         if not finite.all():
             self._report.warn(
-                gprim.site.prim.GetPath(), "{n} instances with infinite transforms left out", int((~finite).sum())
+                gprim.drawn.prim.GetPath(), "{n} instances with infinite transforms skipped", int((~finite).sum())
             )
         colors = group.world_colors()
         matrices, colors = matrices[finite], None if colors is None else colors[finite]
         return _Prototype(matrices, colors, well_conditioned(matrices))
 
-    def _unfit(self, gprim: _Gprim, prototype: _Prototype, places: Floats, colors: Floats | None) -> Mesh | None:
-        """The copies whose matrices collapse the prototype, or nearly, in the world."""
-        matrices = prototype.matrices[~prototype.fit]
-        if len(matrices) * len(places) * len(gprim.shape.triangles) > MAX_FLATTENED_TRIANGLES:
-            path = gprim.site.prim.GetPath()
-            self._report.warn(path, "{n} instances with singular transforms left out", len(matrices))
+    def _singular_copies(
+        self, gprim: _Gprim, prototype: _Prototype, matrices_in_level: Floats, colors: Floats | None
+    ) -> Mesh | None:
+        """Copies of the instances whose transforms are singular, or nearly, in the world."""
+        matrices = prototype.matrices[~prototype.invertible]
+        if len(matrices) * len(matrices_in_level) * len(gprim.shape.triangles) > MAX_FLATTENED_TRIANGLES:
+            path = gprim.drawn.prim.GetPath()
+            self._report.warn(path, "{n} instances with singular transforms skipped", len(matrices))
             return None
-        outer = None if prototype.colors is None else prototype.colors[~prototype.fit]
-        given = nested_colors([(len(matrices), outer), (len(places), colors)])
-        return self._mesh(gprim, nested_transforms([matrices, places]), given)
+        outer_colors = None if prototype.colors is None else prototype.colors[~prototype.invertible]
+        copy_colors = nested_colors([(len(matrices), outer_colors), (len(matrices_in_level), colors)])
+        return self._mesh(gprim, nested_transforms([matrices, matrices_in_level]), copy_colors)
 
     def _shape(self, prim: Usd.Prim) -> TriangleMesh | None:
-        """The prim's triangles in its own space; instances of the same prototype share them."""
+        """The prim's triangles in its own space, cached; instances of a native prototype share them."""
         shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
         key = (shared, *pose_key(prim))
         if key not in self._shapes:
@@ -288,66 +310,73 @@ class _Builder:
                 self._report.warn(prim.GetPath(), f"{trouble}; the prim is skipped")
                 shape = None
             if shape is not None and shape.degenerate_faces:
-                self._report.warn(prim.GetPath(), "{n} degenerate faces left out", shape.degenerate_faces)
+                self._report.warn(prim.GetPath(), "{n} degenerate faces skipped", shape.degenerate_faces)
                 self._report.stats["degenerate_faces"] += shape.degenerate_faces
             self._shapes[key] = shape if shape is not None and len(shape.triangles) else None
         return self._shapes[key]
 
     def _read(self, prim: Usd.Prim) -> TriangleMesh | None:
-        kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
-        if kind in IMPLICIT:
-            return read_implicit(prim, kind, self._time)
-        if kind == "TetMesh":
+        """The shape of a gprim by its schema."""
+        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        if schema in IMPLICIT:
+            return read_implicit(prim, schema, self._time)
+        if schema == "TetMesh":
             return read_tet_mesh(prim, self._time, self._report)
         return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
-    def _mesh(self, gprim: _Gprim, places: Floats, given: Floats | None, *, shared: bool = False) -> Mesh | None:
-        """A gprim in all its places as one mesh.
+    def _mesh(
+        self, gprim: _Gprim, matrices_in_level: Floats, instance_colors: Floats | None, *, shared: bool = False
+    ) -> Mesh | None:
+        """The copies of a gprim as one mesh; None if no triangle is left.
 
         Args:
-            gprim: What.
-            places: Of its level, [k, 4, 4].
-            given: The places' own colours [k, 3], or None.
-            shared: Whether it is a prototype's: then it says where its instances may colour it.
+            gprim: The gprim.
+            matrices_in_level: Transforms of its level, [k, 4, 4].
+            instance_colors: Colours of the copies [k, 3], or None.
+            shared: Whether the mesh belongs to a prototype and marks the triangles that instances may colour.
         """
-        prim, shape, look = gprim.site.prim, gprim.shape, gprim.look
-        matrices = places @ gprim.site.local
+        prim, shape, assignment = gprim.drawn.prim, gprim.shape, gprim.assignment
+        matrices = matrices_in_level @ gprim.drawn.level_from_prim
         finite = np.isfinite(matrices).all(axis=(1, 2))
         if not finite.all():
-            self._report.warn(prim.GetPath(), "{n} copies with infinite transforms left out", int((~finite).sum()))
-            matrices, given = matrices[finite], None if given is None else given[finite]
+            self._report.warn(prim.GetPath(), "{n} copies with infinite transforms skipped", int((~finite).sum()))
+            matrices, instance_colors = matrices[finite], None if instance_colors is None else instance_colors[finite]
             if not finite.any():
                 return None
         copies = len(matrices)
         points, triangles, normals = self._placed(shape, matrices, shared=shared)
-        material, colors = np.tile(look.material, copies), self._colors(look, given, copies)
-        uvs = {name: np.tile(corners, (copies, 1, 1)) for name, corners in look.uvs.items()}
+        material, colors = np.tile(assignment.material, copies), self._colors(assignment, instance_colors, copies)
+        uvs = {name: np.tile(corners, (copies, 1, 1)) for name, corners in assignment.uvs.items()}
         mirrored = np.repeat(np.linalg.det(matrices[:, :3, :3]) < 0.0, len(shape.triangles))
-        if mirrored.any():  # `instantiate` has reversed their winding
+        if mirrored.any():  # `instantiate` reverses their winding
             for corners in (*uvs.values(), *([] if colors is None else [colors])):
                 corners[mirrored] = corners[mirrored][:, ::-1]
-        bare = np.tile(look.bare, copies) if shared and look.bare is not None else None
+        bare = np.tile(assignment.bare, copies) if shared and assignment.bare is not None else None
         if (np.linalg.det(matrices[:, :3, :3]) == 0.0).any():
-            # A flattened copy keeps the triangles that still have an area.
+            # A copy with a singular transform keeps the triangles that still have an area.
             order = np.arange(len(triangles))
-            kept = drop_degenerate(TriangleMesh(points, triangles, order, triangles, normals))
-            triangles, material = kept.triangles, material[kept.face]
-            normals = None if kept.normals is None else _or_geometric(kept.normals, points, triangles)
-            colors = None if colors is None else colors[kept.face]
-            uvs = {name: corners[kept.face] for name, corners in uvs.items()}
-            bare = None if bare is None else bare[kept.face]
+            remaining = drop_degenerate(TriangleMesh(points, triangles, order, triangles, normals))
+            triangles, material = remaining.triangles, material[remaining.face]
+            normals = (
+                None
+                if remaining.normals is None
+                else _fill_with_geometric_normals(remaining.normals, points, triangles)
+            )
+            colors = None if colors is None else colors[remaining.face]
+            uvs = {name: corners[remaining.face] for name, corners in uvs.items()}
+            bare = None if bare is None else bare[remaining.face]
         if len(triangles) == 0:
             return None
-        lamp, light = self._lamp(gprim.site), None
-        if lamp is not None:
-            light = lamp.light(matrices[0])
+        mesh_light, light = self._mesh_light(gprim.drawn), None
+        if mesh_light is not None:
+            light = mesh_light.light(matrices[0])
             used, material = np.unique(material, return_inverse=True)
             area = 0.5 * float(np.linalg.norm(cross_products(points, triangles), axis=1).sum()) / copies
-            lit = lamp.materials([self._table.materials[i] for i in used], area)
-            material = np.array([self._table.add(m) for m in lit], dtype=np.int32)[material]
-            if not any(max(m.albedo) > 0.0 for m in lit):
-                colors = None  # a light that answers with no material reflects no colour either
-        # Of the implicit shapes only the plane is double-sided unless it says otherwise; its schema knows.
+            light_materials = mesh_light.materials([self._table.materials[i] for i in used], area)
+            material = np.array([self._table.add(m) for m in light_materials], dtype=np.int32)[material]
+            if not any(max(m.albedo) > 0.0 for m in light_materials):
+                colors = None  # a light without material response reflects nothing, whatever its primvars
+        # The schema's fallback applies: of the implicit shapes only Plane is double-sided.
         double_sided = read.flag(prim.GetAttribute("doubleSided"), self._time)
         tangents = self._tangents(points, triangles, normals, uvs, material)
         return Mesh(
@@ -359,7 +388,7 @@ class _Builder:
     def _tangents(
         self, points: Floats, triangles: Ints, normals: Floats | None, uvs: Mapping[str, Floats], material: Ints
     ) -> Floats | None:
-        """Those of smooth surfaces with normal maps, float32 [m, 3, 3]; None where triangles' own will do."""
+        """Tangents of smooth surfaces with normal maps, float32 [m, 3, 3]; None where the triangles' own suffice."""
         maps = {int(k): self._table.materials[k].normal_texture for k in np.unique(material)}
         names = {k: texture.uv for k, texture in maps.items() if texture is not None and texture.uv in uvs}
         if normals is None or not names:
@@ -367,29 +396,31 @@ class _Builder:
         tangents = np.zeros((len(triangles), 3, 3), np.float32)
         for name in dict.fromkeys(names.values()):
             chosen = np.isin(material, [k for k, uv in names.items() if uv == name])
-            of_these = triangles[chosen], normals[chosen], uvs[name][chosen]
-            tangents[chosen] = smooth_tangents(points, *of_these)
+            corners_of_map = triangles[chosen], normals[chosen], uvs[name][chosen]
+            tangents[chosen] = smooth_tangents(points, *corners_of_map)
         return tangents
 
     def _placed(self, shape: TriangleMesh, matrices: Floats, *, shared: bool) -> tuple[Floats, Ints, Floats | None]:
-        """Copies of a shape; the same arrays for prototypes of the same geometry, which then share their tree."""
+        """Copies of a shape; prototypes of equal geometry share the arrays, and thereby their BVH."""
         if not shared:
             return instantiate(shape, matrices)
         key = (id(shape.points), digest(shape.triangles), digest(matrices))
-        if key not in self._known:
-            self._known[key] = instantiate(shape, matrices)
-        return self._known[key]
+        if key not in self._placed_cache:
+            self._placed_cache[key] = instantiate(shape, matrices)
+        return self._placed_cache[key]
 
-    def _colors(self, look: Look, given: Floats | None, copies: int) -> Floats | None:
-        """Albedo of the corners, float32 [k m, 3, 3], where a material's alone will not do."""
-        if given is None or look.bare is None:
-            return None if look.colors is None else np.tile(look.colors, (copies, 1, 1))
-        given = given.astype(np.float32)[:, None]
-        per_triangle = np.where(look.bare[None, :, None], given, self._table.albedo(look.material)[None])
+    def _colors(self, assignment: MaterialAssignment, instance_colors: Floats | None, copies: int) -> Floats | None:
+        """Albedo of the corners, float32 [k m, 3, 3]; None where that of the materials suffices."""
+        if instance_colors is None or assignment.bare is None:
+            return None if assignment.colors is None else np.tile(assignment.colors, (copies, 1, 1))
+        instance_colors = instance_colors.astype(np.float32)[:, None]
+        per_triangle = np.where(
+            assignment.bare[None, :, None], instance_colors, self._table.albedo(assignment.material)[None]
+        )
         return np.repeat(per_triangle.reshape(-1, 1, 3), 3, axis=1)
 
-    def _only_used(self, meshes: Sequence[Mesh]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
-        """The meshes with a table that holds no material in vain."""
+    def _without_unused_materials(self, meshes: Sequence[Mesh]) -> tuple[tuple[Mesh, ...], tuple[Material, ...]]:
+        """The meshes with a material table without unused entries."""
         table = self._table.materials
         used = np.zeros(len(table), dtype=bool)
         for mesh in meshes:
@@ -398,12 +429,12 @@ class _Builder:
         if not used.any():
             return tuple(meshes), (Material(),)
         index = (np.cumsum(used) - 1).astype(np.int32)
-        renamed = tuple(replace(mesh, material=index[mesh.material]) for mesh in meshes)
-        return renamed, tuple(m for m, is_used in zip(table, used, strict=True) if is_used)
+        remapped = tuple(replace(mesh, material=index[mesh.material]) for mesh in meshes)
+        return remapped, tuple(m for m, is_used in zip(table, used, strict=True) if is_used)
 
 
-def _or_geometric(normals: Floats, points: Floats, triangles: Ints) -> Floats:
-    """The normals, float32 [m, 3, 3], with the geometric one wherever flattening left none."""
+def _fill_with_geometric_normals(normals: Floats, points: Floats, triangles: Ints) -> Floats:
+    """The normals, float32 [m, 3, 3], with the geometric normal where a singular transform left none."""
     geometric = cross_products(points, triangles)
     geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
     usable = np.linalg.norm(normals, axis=-1, keepdims=True) > 0.5

@@ -1,4 +1,4 @@
-"""Cameras: which one is meant, what it sees, and one that frames the scene where there is none."""
+"""Camera prims: choosing one, reading it, and a camera that frames a scene without one."""
 
 import math
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ from warp_ir.scene import MAX_CLIPPING_PLANES, Camera, Floats, InputError, Proje
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
-_TENTH = 0.1
+_APERTURE_UNIT = 0.1
 """Apertures and focal lengths are in tenths of a scene unit."""
 
 
-def find_camera(stage: Usd.Stage, name: str | None, wanted: str, report: Report) -> Usd.Prim | None:
-    """The camera to render: named, else of the render settings, else the primary one, else the first.
+def find_camera(stage: Usd.Stage, name: str | None, settings_camera: str, report: Report) -> Usd.Prim | None:
+    """The camera to render: the named one, else that of the render settings, else the primary one, else the first.
 
     Args:
         stage: The stage.
         name: Absolute path, or name of a camera prim; None to choose.
-        wanted: Path of the camera that the render settings name; "" if there is none.
-        report: Where a guess is reported.
+        settings_camera: Path of the camera that the render settings name; "" if there is none.
+        report: Receives a warning of an arbitrary choice.
 
     Returns:
         The prim, or None if there is no camera.
@@ -37,8 +37,8 @@ def find_camera(stage: Usd.Stage, name: str | None, wanted: str, report: Report)
                 return prim
         available = ", ".join(str(prim.GetPath()) for prim in cameras) or "none"
         raise InputError(f"{report.source}: no camera '{name}'; available: {available}")
-    if wanted:
-        return stage.GetPrimAtPath(wanted)
+    if settings_camera:
+        return stage.GetPrimAtPath(settings_camera)
     primary = UsdUtils.GetPrimaryCameraName()
     chosen = next((prim for prim in cameras if prim.GetName() == primary), cameras[0] if cameras else None)
     if chosen is not None and len(cameras) > 1 and chosen.GetName() != primary:
@@ -47,13 +47,13 @@ def find_camera(stage: Usd.Stage, name: str | None, wanted: str, report: Report)
 
 
 def all_cameras(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Every camera, in instances too."""
+    """All cameras, those in instances included."""
     predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
     return [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), predicate) if prim.IsA(UsdGeom.Camera)]
 
 
 def read_shutter(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[float, float]:
-    """When a camera's shutter opens and closes [time codes after the frame]; the same if it is not open at all."""
+    """Times at which the shutter opens and closes [time codes after the frame]; equal if it does not open."""
     camera = UsdGeom.Camera(prim)
     try:
         opens = read.number(camera.GetShutterOpenAttr(), time, 0.0)
@@ -62,7 +62,7 @@ def read_shutter(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[fl
         report.warn(prim.GetPath(), f"{trouble}; no motion blur")
         return 0.0, 0.0
     if closes < opens:
-        report.warn(prim.GetPath(), f"its shutter closes at {closes:g}, before it opens: no motion blur")
+        report.warn(prim.GetPath(), f"shutter:close, {closes:g}, is before shutter:open, {opens:g}: no motion blur")
         return 0.0, 0.0
     return opens, closes
 
@@ -92,47 +92,47 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
             return default
 
     if read.text(camera.GetProjectionAttr(), time) == UsdGeom.Tokens.orthographic:
-        projection, unit = Projection.ORTHOGRAPHIC, _TENTH
+        projection, unit = Projection.ORTHOGRAPHIC, _APERTURE_UNIT
     else:
         projection, unit = Projection.PERSPECTIVE, 1.0 / positive(camera.GetFocalLengthAttr(), 50.0)
     half_x = 0.5 * positive(camera.GetHorizontalApertureAttr(), 20.955)
     half_y = 0.5 * positive(camera.GetVerticalApertureAttr(), 15.2908)
     x = optional(camera.GetHorizontalApertureOffsetAttr(), 0.0)
     y = optional(camera.GetVerticalApertureOffsetAttr(), 0.0)
-    lens, focus = 0.0, optional(camera.GetFocusDistanceAttr(), 0.0)
-    stop = optional(camera.GetFStopAttr(), 0.0)
-    if stop > 0.0 and projection == Projection.ORTHOGRAPHIC:
+    lens_radius, focus = 0.0, optional(camera.GetFocusDistanceAttr(), 0.0)
+    f_stop = optional(camera.GetFStopAttr(), 0.0)
+    if f_stop > 0.0 and projection == Projection.ORTHOGRAPHIC:
         report.warn(prim.GetPath(), "fStop: an orthographic camera has no depth of field")
-    elif stop > 0.0 and focus <= 0.0:
+    elif f_stop > 0.0 and focus <= 0.0:
         report.warn(prim.GetPath(), f"focusDistance is {focus:g}: no depth of field")
-    elif stop > 0.0:
-        lens = 0.5 * _TENTH / (unit * stop)
-    exposure = _exposure(camera, time)
+    elif f_stop > 0.0:
+        lens_radius = 0.5 * _APERTURE_UNIT / (unit * f_stop)
+    exposure = _exposure_scale(camera, time)
     if not (math.isfinite(exposure) and exposure >= 0.0):
         report.warn(prim.GetPath(), f"its exposure scale is {exposure:g}; 1 is used")
         exposure = 1.0
     return Camera(
         name=str(prim.GetPath()),
-        world_from_camera=_rigid(prim, time, report),
+        world_from_camera=_rigid_transform(prim, time, report),
         window=((x - half_x) * unit, (x + half_x) * unit, (y - half_y) * unit, (y + half_y) * unit),
         projection=projection,
         clipping=_clipping(camera, time, report),
         clipping_planes=_clipping_planes(camera, time, report),
         exposure=exposure,
-        lens_radius=lens,
-        focus_distance=focus if lens > 0.0 else 1.0,
+        lens_radius=lens_radius,
+        focus_distance=focus if lens_radius > 0.0 else 1.0,
     )
 
 
 def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
-    """The camera with which `usdrecord` shows a stage that has none (its `_ComputeCameraToFrameStage`).
+    """The camera with which `usdrecord` frames a stage without one (its `_ComputeCameraToFrameStage`).
 
-    What is tall, usdrecord cuts off above and below; this camera steps back until all of it is in the picture.
+    usdrecord crops tall scenes above and below; this camera moves back until the whole scene is in the picture.
 
     Args:
-        lower: Corner of the scene's bounds, [3].
-        upper: The opposite corner.
-        up_axis: "Y": it looks along -Z; "Z": along +Y.
+        lower: Minimum corner of the scene's bounds, [3].
+        upper: Maximum corner, [3].
+        up_axis: "Y": the camera looks along -Z; "Z": along +Y.
     """
     default = Gf.Camera()
     half_x = 0.5 * default.horizontalAperture / default.focalLength
@@ -148,18 +148,18 @@ def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
     return Camera("framing camera", matrix, (-half_x, half_x, -half_y, half_y))
 
 
-def standing_camera(eye: Sequence[float], target: Sequence[float], up_axis: str) -> Camera:
-    """A camera with USD's default lens at one point that looks at another, upright.
+def eye_camera(eye: Sequence[float], target: Sequence[float], up_axis: str) -> Camera:
+    """A camera with USD's default lens at one point that looks at another, with the up axis upright.
 
     Raises:
-        InputError: The points coincide, or lie above each other.
+        InputError: The points coincide, or the direction between them is the up axis.
     """
-    lens = framing_camera(np.zeros(3), np.ones(3), up_axis)
+    lens_radius = framing_camera(np.zeros(3), np.ones(3), up_axis)
     up = (0.0, 1.0, 0.0) if up_axis == "Y" else (0.0, 0.0, 1.0)
-    return replace(lens, name="eye", world_from_camera=Camera.look_at(eye, target, up).world_from_camera)
+    return replace(lens_radius, name="eye", world_from_camera=Camera.look_at(eye, target, up).world_from_camera)
 
 
-def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
+def _rigid_transform(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
     """world_from_camera without scale and shear; a mirrored camera keeps its view and up directions."""
     try:
         matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)).T
@@ -169,7 +169,7 @@ def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
     back, up = matrix[:3, 2], matrix[:3, 1]
     right = np.cross(up, back)
     if not (np.isfinite(matrix).all() and np.linalg.norm(right) > 0.0):
-        report.warn(prim.GetPath(), "its transform is degenerate; the camera stands at the origin")
+        report.warn(prim.GetPath(), "its transform is degenerate; the identity is used")
         return np.eye(4)
     rigid = np.eye(4)
     rigid[:3, 2] = back / np.linalg.norm(back)
@@ -180,6 +180,7 @@ def _rigid(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:
 
 
 def _clipping(camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report) -> tuple[float, float]:
+    """Near and far clipping distance [scene units]."""
     near_far = read.raw(camera.GetClippingRangeAttr(), time)
     try:
         near, far = (float(distance) for distance in np.asarray(near_far).reshape(-1))
@@ -194,26 +195,27 @@ def _clipping(camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report) -> tup
 def _clipping_planes(
     camera: UsdGeom.Camera, time: Usd.TimeCode, report: Report
 ) -> tuple[tuple[float, float, float, float], ...]:
+    """Clipping planes (a, b, c, d); invalid ones and those beyond the limit are skipped."""
     try:
         planes = read.floats(camera.GetClippingPlanesAttr(), time, 4)
     except Unreadable as trouble:
-        report.warn(camera.GetPath(), f"{trouble}; nothing is cut away")
+        report.warn(camera.GetPath(), f"{trouble}; no plane clips")
         return ()
     if planes is None:
         return ()
-    # Without a normal a plane cuts away all or nothing: that is no plane.
+    # A plane without a normal clips all or nothing: it is invalid.
     usable = np.isfinite(planes).all(axis=1) & (np.abs(planes[:, :3]).max(axis=1) > 0.0)
     if not usable.all():
-        report.warn(camera.GetPath(), "clippingPlanes: {n} that are no planes are ignored", int((~usable).sum()))
+        report.warn(camera.GetPath(), "clippingPlanes: {n} invalid planes are ignored", int((~usable).sum()))
     planes = planes[usable]
     if len(planes) > MAX_CLIPPING_PLANES:
-        report.warn(camera.GetPath(), f"clippingPlanes: of {len(planes)} the first {MAX_CLIPPING_PLANES} cut")
+        report.warn(camera.GetPath(), f"clippingPlanes: only the first {MAX_CLIPPING_PLANES} of {len(planes)} clip")
     return tuple((a, b, c, d) for a, b, c, d in planes[:MAX_CLIPPING_PLANES].tolist())
 
 
-def _exposure(camera: UsdGeom.Camera, time: Usd.TimeCode) -> float:
-    """Factor on the film's radiance, from the schema's exposure controls."""
+def _exposure_scale(camera: UsdGeom.Camera, time: Usd.TimeCode) -> float:
+    """Scale of the film's radiance, from the schema's exposure attributes."""
     try:
         return float(camera.ComputeLinearExposureScale(time))
-    except (AttributeError, Tf.ErrorException):  # the schema gained its exposure controls in 25.05
+    except (AttributeError, Tf.ErrorException):  # the schema has exposure attributes since USD 25.05
         return 1.0

@@ -1,94 +1,107 @@
-"""What of a stage may change with time: the rest is read once, however many moments are asked for."""
+"""Which prims of a stage may vary with time: all others are read once, for any number of times."""
 
 from collections.abc import Collection, Sequence
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
-from warp_ir.usd.shading.binding import PURPOSES, bound_materials, order_of
+from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
 from warp_ir.usd.values import read
 
 _ALL = Usd.PrimIsActive & Usd.PrimIsLoaded
-"""Prototypes may live below an `over` or a `class`."""
-_CARRYING = ("velocities", "accelerations", "angularVelocities")
-"""Attributes that move what they belong to away from the time of their sample."""
-_PLACING = ("xformOp:", "visibility")
-"""Attributes that say where and whether a prim is drawn, not what it is."""
+"""Predicate that includes `over` and `class`, below which prototypes may be defined."""
+_VELOCITY_ATTRIBUTES = ("velocities", "accelerations", "angularVelocities")
+"""Attributes that move points or instances away from the time of their sample."""
+_TRANSFORM_ATTRIBUTES = ("xformOp:", "visibility")
+"""Prefixes of attributes that decide where and whether a prim is drawn, not its geometry."""
 
 
-class Motion:
-    """Which prims of a stage may look different, or be elsewhere, at another time."""
+class TimeVarying:
+    """Tells which prims of a stage may differ in geometry, material or transform between two times.
+
+    Args:
+        stage: The stage; it is scanned once.
+    """
 
     def __init__(self, stage: Usd.Stage) -> None:
-        self._moving: set[Sdf.Path] = set()
-        self._known: dict[Sdf.Path, bool] = {}
-        self._networks: dict[Sdf.Path, bool] = {}
-        self._shading = False
+        self._varying_layout: set[Sdf.Path] = set()
+        self._transform_cache: dict[Sdf.Path, bool] = {}
+        self._network_cache: dict[Sdf.Path, bool] = {}
+        self._has_varying_shaders = False
         self.purposes: Sequence[str] = PURPOSES[:2]
-        """Of the bindings of materials that count."""
-        self.rearranges = False
-        """Whether anything that can be drawn may move, appear or vanish."""
+        """Purposes of material bindings, in order of preference."""
+        self.layout_varies = False
+        """Whether a drawable prim's transform or visibility may vary: each time then needs a new traversal."""
         instancers = []
         for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
             for prim in Usd.PrimRange(root, _ALL):
                 if prim.IsA(UsdGeom.Imageable):
-                    if _is_rearranged(prim):
-                        self._moving.add(prim.GetPath())
-                        self.rearranges = self.rearranges or _holds_what_is_drawn(prim)
+                    if _transform_or_visibility_varies(prim):
+                        self._varying_layout.add(prim.GetPath())
+                        self.layout_varies = self.layout_varies or _has_drawables(prim)
                     if prim.IsA(UsdGeom.PointInstancer):
                         instancers.append(prim)
-                elif not self._shading and (prim.IsA(UsdShade.Shader) or prim.IsA(UsdShade.NodeGraph)):
-                    self._shading = _varies(prim)
-        self._follow(instancers)
+                elif not self._has_varying_shaders and (prim.IsA(UsdShade.Shader) or prim.IsA(UsdShade.NodeGraph)):
+                    self._has_varying_shaders = _attributes_vary(prim)
+        self._mark_prototypes(instancers)
 
-    def _follow(self, instancers: Collection[Usd.Prim]) -> None:
-        """The prototypes of an instancer that moves move as well; they may hold instancers."""
-        waiting = list(instancers)
-        while waiting:
-            moving = [prim for prim in waiting if self._placed(prim) or _varies(prim)]
-            for prim in moving:
-                self.rearranges = True
-                self._moving.update(read.targets(UsdGeom.PointInstancer(prim).GetPrototypesRel()))
-            waiting = [prim for prim in waiting if prim not in moving] if moving else []
-            self._known.clear()
+    def _mark_prototypes(self, instancers: Collection[Usd.Prim]) -> None:
+        """Marks the prototypes of varying instancers as varying.
 
-    def moves(self, prim: Usd.Prim) -> bool:
-        """Whether a gprim, camera or light may be elsewhere, or another, at another time."""
-        return self._placed(prim) or _varies(prim) or self._looks(prim) or self._is_skinned(prim)
+        Prototypes may contain instancers: the marking is repeated until nothing changes.
+        """
+        unmarked = list(instancers)
+        while unmarked:
+            varying = [prim for prim in unmarked if self._transform_varies(prim) or _attributes_vary(prim)]
+            for prim in varying:
+                self.layout_varies = True
+                self._varying_layout.update(read.targets(UsdGeom.PointInstancer(prim).GetPrototypesRel()))
+            unmarked = [prim for prim in unmarked if prim not in varying] if varying else []
+            self._transform_cache.clear()
 
-    def reshapes(self, prim: Usd.Prim) -> bool:
-        """Whether its geometry may be another, its place and its looks apart."""
-        return _varies(prim) or self._is_skinned(prim)
+    def varies(self, prim: Usd.Prim) -> bool:
+        """Whether attributes, material, transform or skinning of a gprim, camera or light may vary."""
+        return (
+            self._transform_varies(prim)
+            or _attributes_vary(prim)
+            or self._material_varies(prim)
+            or self._is_skinned(prim)
+        )
 
-    def _placed(self, prim: Usd.Prim) -> bool:
-        """Whether the prim or what is above it may move, vanish, or change the primvars that it hands down."""
+    def deforms(self, prim: Usd.Prim) -> bool:
+        """Whether the geometry may vary; transform and material are not considered."""
+        return _attributes_vary(prim) or self._is_skinned(prim)
+
+    def _transform_varies(self, prim: Usd.Prim) -> bool:
+        """Whether transform, visibility or inherited primvars may vary: on the prim itself or on an ancestor."""
         chain = []
-        while prim and not prim.IsPseudoRoot() and prim.GetPath() not in self._known:
+        while prim and not prim.IsPseudoRoot() and prim.GetPath() not in self._transform_cache:
             chain.append(prim)
             prim = prim.GetParent()
-        moves = bool(prim) and not prim.IsPseudoRoot() and self._known[prim.GetPath()]
+        result = bool(prim) and not prim.IsPseudoRoot() and self._transform_cache[prim.GetPath()]
         for prim in reversed(chain):
             own = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
-            here = own.GetPath() in self._moving or prim.GetPath() in self._moving
-            moves = moves or here or _varies(prim, "primvars:")
-            self._known[prim.GetPath()] = moves
-        return moves
+            marked = own.GetPath() in self._varying_layout or prim.GetPath() in self._varying_layout
+            result = result or marked or _attributes_vary(prim, "primvars:")
+            self._transform_cache[prim.GetPath()] = result
+        return result
 
-    def _looks(self, prim: Usd.Prim) -> bool:
-        """Whether a material bound to the prim, or to a part of it, may change."""
-        if not self._shading:
+    def _material_varies(self, prim: Usd.Prim) -> bool:
+        """Whether a material bound to the prim, or to a GeomSubset of it, may vary."""
+        if not self._has_varying_shaders:
             return False
         prims = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
-        found = bound_materials(prims, order_of(self.purposes))
-        return any(self._network(pair[0].GetPrim()) for pair in found if pair is not None)
+        bindings = bound_materials(prims, purposes_to_try(self.purposes))
+        return any(self._network_varies(pair[0].GetPrim()) for pair in bindings if pair is not None)
 
-    def _network(self, material: Usd.Prim) -> bool:
-        if material.GetPath() not in self._networks:
+    def _network_varies(self, material: Usd.Prim) -> bool:
+        """Whether any attribute of the material's shading network may vary; cached."""
+        if material.GetPath() not in self._network_cache:
             below = Usd.PrimRange(material, Usd.TraverseInstanceProxies(_ALL))
-            self._networks[material.GetPath()] = any(_varies(prim) for prim in below)
-        return self._networks[material.GetPath()]
+            self._network_cache[material.GetPath()] = any(_attributes_vary(prim) for prim in below)
+        return self._network_cache[material.GetPath()]
 
     def _is_skinned(self, prim: Usd.Prim) -> bool:
-        """Whether a skeleton may bend it: what moves the joints is written elsewhere."""
+        """Whether a skeleton may deform it: joint transforms are authored on other prims."""
         while prim and not prim.IsPseudoRoot():
             if prim.HasAPI(UsdSkel.BindingAPI) or prim.IsA(UsdSkel.Root):
                 return True
@@ -96,33 +109,40 @@ class Motion:
         return False
 
 
-def _is_rearranged(prim: Usd.Prim) -> bool:
-    """Whether a prim may move, or another part of what is below it be shown."""
+def _transform_or_visibility_varies(prim: Usd.Prim) -> bool:
+    """Whether a prim's transform or visibility, or the choice of its drawn children, may vary."""
     if UsdGeom.Imageable(prim).GetVisibilityAttr().ValueMightBeTimeVarying():
         return True
     schemas = prim.GetAppliedSchemas()
-    if ("VisibilityAPI" in schemas or "LODRootAPI" in schemas) and _varies(prim):
+    if ("VisibilityAPI" in schemas or "LODRootAPI" in schemas) and _attributes_vary(prim):
         return True
     try:
         return bool(prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying())
-    except Tf.ErrorException:  # the walk names what is wrong with it
+    except Tf.ErrorException:  # the traversal reports the invalid transform
         return False
 
 
-def _holds_what_is_drawn(prim: Usd.Prim) -> bool:
-    """Whether there is more than cameras below a prim."""
+def _has_drawables(prim: Usd.Prim) -> bool:
+    """Whether a prim or a descendant can be drawn or emit light; cameras do not count."""
     return any(
         below.IsA(UsdGeom.Boundable) or below.IsA(UsdLux.NonboundableLightBase) or below.IsInstance()
         for below in Usd.PrimRange(prim, _ALL)
     )
 
 
-def _varies(prim: Usd.Prim, prefix: str = "") -> bool:
-    """Whether an attribute of the prim, or of a subset of its faces, may change; where it is apart."""
+def _attributes_vary(prim: Usd.Prim, prefix: str = "") -> bool:
+    """Whether an authored attribute whose name has a prefix may vary; transforms and visibility are not considered.
+
+    Without a prefix, velocities and the attributes of GeomSubsets count as well.
+    """
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        if not prefix and name in _CARRYING:
+        if not prefix and name in _VELOCITY_ATTRIBUTES:
             return True
-        if name.startswith(prefix) and not name.startswith(_PLACING) and attribute.ValueMightBeTimeVarying():
+        if (
+            name.startswith(prefix)
+            and not name.startswith(_TRANSFORM_ATTRIBUTES)
+            and attribute.ValueMightBeTimeVarying()
+        ):
             return True
-    return not prefix and any(_varies(child) for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))
+    return not prefix and any(_attributes_vary(child) for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))

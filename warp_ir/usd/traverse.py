@@ -1,4 +1,4 @@
-"""The walk over a stage: which gprims and lights are drawn, and where; instances included."""
+"""Traversal of a stage: which gprims and lights are drawn, and with which transforms, instances included."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -14,76 +14,84 @@ from warp_ir.usd.settings.render_pass import RenderPass
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
-_DEPTH = 16
-"""Deepest nesting of point instancers that is followed."""
-LIGHT_COPIES = 100_000
-"""Most copies of one light."""
-_FOREIGN = 6
-"""How many types of other programs are named."""
-_NOTES = ("HoudiniLayerInfo",)
-"""Types of other programs that are no part of a scene."""
+_MAX_INSTANCER_DEPTH = 16
+"""Maximum nesting depth of point instancers."""
+MAX_LIGHT_COPIES = 100_000
+"""Maximum number of instances of one light."""
+_MAX_NAMED_TYPES = 6
+"""Maximum number of unknown prim types that one warning lists."""
+_METADATA_TYPES = ("HoudiniLayerInfo",)
+"""Unknown prim types that hold metadata only: they are not reported."""
 
 _IDENTITY = Gf.Matrix4d(1.0)
 _WORLD = InstanceLevel(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
-_SHAPES = {"Mesh", "TetMesh", *IMPLICIT}
-_DRAWN = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-# A prototype may live below an `over` or a `class`, which keeps it from being drawn where it stands.
-_PROTOTYPE = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
+_GPRIM_TYPES = {"Mesh", "TetMesh", *IMPLICIT}
+_DRAWN_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+# A prototype may be defined below an `over` or a `class`, which are not drawn themselves.
+_PROTOTYPE_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
-    """A prim and the places where it is drawn."""
+class DrawnPrim:
+    """A prim that is drawn, with the transforms of all its instances."""
 
     prim: Usd.Prim
     level: InstanceLevel
-    """The prototype that it is part of; the outermost is the world."""
-    local: Floats
-    """level_from_prim, float64 [4, 4]."""
-
-    lamp: Usd.Prim | None = None
-    """The GeometryLight that makes a gprim emit, if there is one."""
+    """The instancing level that contains the prim; the outermost level is the world."""
+    level_from_prim: Floats
+    """Transform from the prim to its level, float64 [4, 4]."""
+    geometry_light: Usd.Prim | None = None
+    """The GeometryLight whose `geometry` relationship targets this gprim; None: there is none."""
 
     @property
     def matrices(self) -> Floats:
-        """world_from_prim for every place, float64 [k, 4, 4]."""
-        return self.level.world_matrices() @ self.local
+        """world_from_prim of every instance, float64 [k, 4, 4]."""
+        return self.level.world_matrices() @ self.level_from_prim
 
 
 @dataclass(eq=False)
-class Found:
-    """What is drawn."""
+class DrawnPrims:
+    """The gprims and lights that are drawn."""
 
-    shapes: list[Site] = field(default_factory=list)
-    lights: list[Site] = field(default_factory=list)
+    gprims: list[DrawnPrim] = field(default_factory=list)
+    lights: list[DrawnPrim] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
-class _Visit:
-    """A prim still to be visited, with what it inherits."""
+class _PendingPrim:
+    """A prim on the stack of the traversal, with the state it inherits."""
 
     prim: Usd.Prim
     level: InstanceLevel
-    local: Floats
+    level_from_prim: Floats
     purpose: object | None
     instancers: tuple[Sdf.Path, ...]
 
 
-def walk(
+def traverse_stage(
     stage: Usd.Stage,
     time: Usd.TimeCode,
     purposes: Collection[str],
     report: Report,
     render_pass: RenderPass | None = None,
-) -> Found:
-    """Visit every prim once per instancer that draws it, and gather gprims and lights.
+) -> DrawnPrims:
+    """Visit every prim once per instancer that draws it, and collect gprims and lights.
 
-    Invisible subtrees, gprims of other purposes and what takes no part in the render pass are counted and left out.
+    Invisible subtrees, gprims of other purposes and prims outside the render pass are counted and skipped.
+
+    Args:
+        stage: The stage; its pseudo-root is the start.
+        time: Time code of all values.
+        purposes: The purposes to draw.
+        report: Receives warnings and counts.
+        render_pass: The render pass that filters prims; None: all take part.
     """
-    return _Walk(stage, time, purposes, report, render_pass).run()
+    return _Traversal(stage, time, purposes, report, render_pass).run()
 
 
-class _Walk:
+class _Traversal:
+    """State of one traversal; see `traverse_stage`."""
+
     def __init__(
         self,
         stage: Usd.Stage,
@@ -95,177 +103,187 @@ class _Walk:
         self._stage, self._time, self._purposes, self._report = stage, time, purposes, report
         self._pass = render_pass
         self._transforms = UsdGeom.XformCache(time)
-        self._found = Found()
-        self._foreign: dict[Sdf.Path, str] = {}
-        self._lamps: list[Usd.Prim] = []
+        self._drawn = DrawnPrims()
+        self._unknown_types: dict[Sdf.Path, str] = {}
+        self._geometry_lights: list[Usd.Prim] = []
 
-    def run(self) -> Found:
-        root = _Visit(self._stage.GetPseudoRoot(), _WORLD, np.eye(4), None, ())
-        pending = [root]
-        while pending:  # a stack of our own: hierarchies may be deeper than Python's
-            pending += reversed(self._visit(pending.pop()))
-        self._light_geometry()
-        self._name_foreign()
-        return self._found
+    def run(self) -> DrawnPrims:
+        """Traverses the stage from its pseudo-root."""
+        root = _PendingPrim(self._stage.GetPseudoRoot(), _WORLD, np.eye(4), None, ())
+        stack = [root]
+        while stack:  # an explicit stack: hierarchies may be deeper than Python's recursion limit
+            stack += reversed(self._visit(stack.pop()))
+        self._attach_geometry_lights()
+        self._report_unknown_types()
+        return self._drawn
 
-    def _visit(self, visit: _Visit) -> list[_Visit]:
-        """Gather one prim, and return what is below it."""
-        prim, report = visit.prim, self._report
-        level, local, purpose = visit.level, visit.local, visit.purpose
+    def _visit(self, pending: _PendingPrim) -> list[_PendingPrim]:
+        """Collect one prim; returns its children."""
+        prim, report = pending.prim, self._report
+        level, level_from_prim, purpose = pending.level, pending.level_from_prim, pending.purpose
         if self._pass is not None and self._pass.prunes(prim):
             report.stats["prims_outside_pass"] += 1
             return []
-        name = "default"
+        own_purpose = "default"
         if prim.IsA(UsdGeom.Imageable):
             imageable = UsdGeom.Imageable(prim)
             if read.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
                 report.stats["prims_invisible"] += 1
                 return []
             info = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
-            name, purpose = info.purpose, info
-            level, local = self._placed(prim, level, local)
+            own_purpose, purpose = info.purpose, info
+            level, level_from_prim = self._transformed(prim, level, level_from_prim)
         if prim.IsInstance():
             report.stats["native_instances"] += 1
-            level, local = InstanceLevel(prim.GetPrototype().GetPath(), level, local[None]), np.eye(4)
-        kind = prim.GetPrimTypeInfo().GetSchemaTypeName()
-        if not kind and prim.GetTypeName() not in ("", *_NOTES):
-            self._foreign[prim.GetPath()] = prim.GetTypeName()
+            level, level_from_prim = (
+                InstanceLevel(prim.GetPrototype().GetPath(), level, level_from_prim[None]),
+                np.eye(4),
+            )
+        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        if not schema and prim.GetTypeName() not in ("", *_METADATA_TYPES):
+            self._unknown_types[prim.GetPath()] = prim.GetTypeName()
         if prim.HasAPI(UsdGeom.ModelAPI):
             mode = read.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
             if mode not in ("inherited", "default"):
-                report.warn(prim.GetPath(), f"draw mode '{mode}' is not honoured: the geometry itself is drawn")
-        site = Site(prim, level, local)
-        if kind == "PointInstancer":
-            if not self._takes_part(prim):
+                report.warn(prim.GetPath(), f"draw mode '{mode}' is not supported: the geometry itself is drawn")
+        drawn = DrawnPrim(prim, level, level_from_prim)
+        if schema == "PointInstancer":
+            if not self._in_render_pass(prim):
                 return []
-            return self._instances(visit, level, local, purpose)
-        if kind in _SHAPES:
-            if self._is_drawn(prim, name):
-                self._found.shapes.append(site)
-        elif kind in LIGHTS:
-            if self._is_drawn(prim, name):
-                self._add_light(site)
-        elif kind == "GeometryLight":
-            if self._is_drawn(prim, name):
-                self._lamps.append(prim)
-        elif kind == "PortalLight":
+            return self._prototypes_of(pending, level, level_from_prim, purpose)
+        if schema in _GPRIM_TYPES:
+            if self._is_drawn(prim, own_purpose):
+                self._drawn.gprims.append(drawn)
+        elif schema in LIGHTS:
+            if self._is_drawn(prim, own_purpose):
+                self._add_light(drawn)
+        elif schema == "GeometryLight":
+            if self._is_drawn(prim, own_purpose):
+                self._geometry_lights.append(prim)
+        elif schema == "PortalLight":
             report.warn(prim.GetPath(), "portals are ignored: they would only guide the sampling of a dome")
-        elif prim.IsA(UsdGeom.Gprim) or kind == "Volume":
-            if self._is_drawn(prim, name):
-                report.warn(prim.GetPath(), f"{kind} prims are not rendered ({{n}} in all)")
-        elif kind == "RenderPass":
+        elif prim.IsA(UsdGeom.Gprim) or schema == "Volume":
+            if self._is_drawn(prim, own_purpose):
+                report.warn(prim.GetPath(), f"{schema} prims are not rendered ({{n}} in all)")
+        elif schema == "RenderPass":
             if self._pass is None:
-                report.warn(prim.GetPath(), "no render pass is selected: all is drawn, whatever takes part in this one")
-        elif kind in ("LightFilter", "PluginLightFilter"):
-            report.warn(prim.GetPath(), "light filters are not read")
-        elif prim.HasAPI(UsdLux.LightAPI) or kind == "PluginLight":
-            report.warn(prim.GetPath(), f"{kind or prim.GetTypeName()} is not read yet: it emits nothing")
-        children = prim.GetFilteredChildren(_PROTOTYPE if visit.instancers else _DRAWN)
+                report.warn(prim.GetPath(), "no render pass is selected: prims outside this one are drawn as well")
+        elif schema in ("LightFilter", "PluginLightFilter"):
+            report.warn(prim.GetPath(), "light filters are not supported")
+        elif prim.HasAPI(UsdLux.LightAPI) or schema == "PluginLight":
+            report.warn(prim.GetPath(), f"{schema or prim.GetTypeName()} is not supported: it emits nothing")
+        children = prim.GetFilteredChildren(_PROTOTYPE_PREDICATE if pending.instancers else _DRAWN_PREDICATE)
         if children and "LODRootAPI" in prim.GetAppliedSchemas():
-            # Levels of detail exclude each other; who cannot choose shows the default one.
-            default = read.raw(prim.GetAttribute("lod:default:index"), self._time)
-            children = children[default if isinstance(default, int) and 0 <= default < len(children) else 0 :][:1]
-        return [_Visit(child, level, local, purpose, visit.instancers) for child in children]
+            # LODRootAPI: children are alternatives; a renderer without heuristics draws lod:default:index.
+            default_index = read.raw(prim.GetAttribute("lod:default:index"), self._time)
+            valid = isinstance(default_index, int) and 0 <= default_index < len(children)
+            children = children[default_index if valid else 0 :][:1]
+        return [_PendingPrim(child, level, level_from_prim, purpose, pending.instancers) for child in children]
 
-    def _placed(self, prim: Usd.Prim, level: InstanceLevel, parent: Floats) -> tuple[InstanceLevel, Floats]:
-        """The level of a prim and its place in it, level_from_prim [4, 4], given those of its parent."""
+    def _transformed(self, prim: Usd.Prim, level: InstanceLevel, parent: Floats) -> tuple[InstanceLevel, Floats]:
+        """The level of a prim and its transform level_from_prim [4, 4], given those of its parent.
+
+        `!resetXformStack!` makes the prim a child of the world.
+        """
         try:
-            local, resets = self._transforms.GetLocalTransformation(prim)
+            transform, resets = self._transforms.GetLocalTransformation(prim)
         except Tf.ErrorException:
             self._report.warn(prim.GetPath(), "its transform cannot be read; the identity is used")
             return level, parent
-        matrix = np.array(local).T
+        matrix = np.array(transform).T
         if not np.isfinite(matrix).all():
             self._report.warn(prim.GetPath(), "its transform is NaN or infinite; the identity is used")
             return level, parent
         if resets:
             return _WORLD, matrix
-        return level, parent if local == _IDENTITY else parent @ matrix
+        return level, parent if transform == _IDENTITY else parent @ matrix
 
     def _is_drawn(self, prim: Usd.Prim, purpose: str) -> bool:
-        """Whether a prim's purpose is wanted, not hidden by VisibilityAPI, and the prim part of the render pass."""
+        """Whether the purpose is included, VisibilityAPI does not hide it, and the render pass contains the prim."""
         if purpose not in self._purposes:
             self._report.stats["prims_other_purpose"] += 1
             self._report.stats[f"prims_{purpose}"] += 1
             return False
-        if purpose != UsdGeom.Tokens.default_ and self._hides(prim, purpose):
+        if purpose != UsdGeom.Tokens.default_ and self._hidden_by_purpose(prim, purpose):
             self._report.stats["prims_invisible"] += 1
             return False
-        return self._takes_part(prim)
+        return self._in_render_pass(prim)
 
-    def _takes_part(self, prim: Usd.Prim) -> bool:
-        """Whether a prim is visible in the render pass, if there is one."""
+    def _in_render_pass(self, prim: Usd.Prim) -> bool:
+        """Whether the render pass, if there is one, contains the prim."""
         if self._pass is None or self._pass.shows(prim):
             return True
         self._report.stats["prims_outside_pass"] += 1
         return False
 
-    def _hides(self, prim: Usd.Prim, purpose: str) -> bool:
-        """What the nearest VisibilityAPI says of a purpose; visibility itself, which need not be inherited, apart."""
+    def _hidden_by_purpose(self, prim: Usd.Prim, purpose: str) -> bool:
+        """Whether the nearest VisibilityAPI hides a purpose; the traversal itself tests the attribute `visibility`."""
         while prim and not prim.IsPseudoRoot():
             if prim.HasAPI(UsdGeom.VisibilityAPI):
                 attribute = UsdGeom.VisibilityAPI(prim).GetPurposeVisibilityAttr(purpose)
-                says = read.text(attribute, self._time) if attribute and attribute.HasAuthoredValue() else ""
-                if says in (UsdGeom.Tokens.visible, UsdGeom.Tokens.invisible):
-                    return bool(says == UsdGeom.Tokens.invisible)
+                visibility = read.text(attribute, self._time) if attribute and attribute.HasAuthoredValue() else ""
+                if visibility in (UsdGeom.Tokens.visible, UsdGeom.Tokens.invisible):
+                    return bool(visibility == UsdGeom.Tokens.invisible)
             prim = prim.GetParent()
         return bool(purpose == UsdGeom.Tokens.guide)
 
-    def _add_light(self, site: Site) -> None:
-        if site.level.instance_count > LIGHT_COPIES:
-            self._report.warn(
-                site.prim.GetPath(), f"{site.level.instance_count} copies of a light: too many, it is left out"
-            )
+    def _add_light(self, drawn: DrawnPrim) -> None:
+        if drawn.level.instance_count > MAX_LIGHT_COPIES:
+            copies = drawn.level.instance_count
+            what = f"{copies} instances of a light exceed the limit of {MAX_LIGHT_COPIES}: it is skipped"
+            self._report.warn(drawn.prim.GetPath(), what)
         else:
-            self._found.lights.append(site)
+            self._drawn.lights.append(drawn)
 
-    def _name_foreign(self) -> None:
-        """Names prims whose types USD does not know, and nobody says what to draw instead (fallbackPrimTypes)."""
-        types = list(dict.fromkeys(self._foreign.values()))
-        more = f" and {len(types) - _FOREIGN} more" if len(types) > _FOREIGN else ""
-        for path in self._foreign:
-            self._report.warn(path, f"not rendered, for USD has no such types: {', '.join(types[:_FOREIGN])}{more}")
+    def _report_unknown_types(self) -> None:
+        """Warns of prims of unknown types without fallbackPrimTypes; their children are drawn."""
+        types = list(dict.fromkeys(self._unknown_types.values()))
+        listed = ", ".join(types[:_MAX_NAMED_TYPES])
+        unlisted = f" and {len(types) - _MAX_NAMED_TYPES} more" if len(types) > _MAX_NAMED_TYPES else ""
+        for path in self._unknown_types:
+            self._report.warn(path, f"not rendered: prim types unknown to USD: {listed}{unlisted}")
 
-    def _light_geometry(self) -> None:
-        """Gives gprims to the deprecated GeometryLights that refer to them."""
-        lamps: dict[Sdf.Path, Usd.Prim] = {}
-        for lamp in self._lamps:
-            targets = read.targets(lamp.GetRelationship("geometry"))
-            lamps.update(dict.fromkeys(targets, lamp))
-            if not any(site.prim.GetPath() in targets for site in self._found.shapes):
-                self._report.warn(lamp.GetPath(), "its geometry is nothing that is drawn: it emits nothing")
-        if lamps:
-            shapes = [replace(site, lamp=lamps.get(site.prim.GetPath())) for site in self._found.shapes]
-            self._found.shapes = shapes
+    def _attach_geometry_lights(self) -> None:
+        """Assigns deprecated GeometryLights to the gprims that they target."""
+        light_by_target: dict[Sdf.Path, Usd.Prim] = {}
+        for geometry_light in self._geometry_lights:
+            targets = read.targets(geometry_light.GetRelationship("geometry"))
+            light_by_target.update(dict.fromkeys(targets, geometry_light))
+            if not any(drawn.prim.GetPath() in targets for drawn in self._drawn.gprims):
+                self._report.warn(geometry_light.GetPath(), "none of its geometry is drawn: it emits nothing")
+        if light_by_target:
+            self._drawn.gprims = [
+                replace(drawn, geometry_light=light_by_target.get(drawn.prim.GetPath())) for drawn in self._drawn.gprims
+            ]
 
-    def _instances(self, visit: _Visit, level: InstanceLevel, local: Floats, purpose: object | None) -> list[_Visit]:
-        """The prototypes of a point instancer, each with all its places."""
-        prim, report = visit.prim, self._report
+    def _prototypes_of(
+        self, pending: _PendingPrim, level: InstanceLevel, level_from_prim: Floats, purpose: object | None
+    ) -> list[_PendingPrim]:
+        """The prototypes of a point instancer, each with the transforms of all its instances."""
+        prim, report = pending.prim, self._report
         path = prim.GetPath()
-        if len(visit.instancers) >= _DEPTH:
-            report.warn(path, f"point instancers nested deeper than {_DEPTH} are not followed")
+        if len(pending.instancers) >= _MAX_INSTANCER_DEPTH:
+            report.warn(path, f"point instancers nested deeper than {_MAX_INSTANCER_DEPTH} are not followed")
             return []
         try:
             groups = read_instancer(prim, self._time, report)
         except Unreadable as trouble:
             report.warn(path, f"{trouble}; the instancer is skipped")
             return []
-        below: list[_Visit] = []
+        children: list[_PendingPrim] = []
         for group in groups:
             prototype = self._stage.GetPrimAtPath(group.prototype)
             if not prototype:
                 report.warn(path, f"its prototype {group.prototype} does not exist")
                 continue
-            if any(used.HasPrefix(group.prototype) for used in (*visit.instancers, path)):
-                report.warn(
-                    path, f"its prototype {group.prototype} holds the instancer itself, or leads back to it; left out"
-                )
+            if any(used.HasPrefix(group.prototype) for used in (*pending.instancers, path)):
+                report.warn(path, f"its prototype {group.prototype} contains the instancer itself; it is skipped")
                 continue
             report.stats["point_instances"] += level.instance_count * len(group.matrices)
             key = (prototype.GetPrimInPrototype() if prototype.IsInstanceProxy() else prototype).GetPath()
-            inner = InstanceLevel(key, level, local @ group.matrices, group.colors, group.primvars)
-            # What lies above a prototype gives it no place and hides it not, but a purpose.
+            inner = InstanceLevel(key, level, level_from_prim @ group.matrices, group.colors, group.primvars)
+            # Ancestors of a prototype contribute neither transform nor visibility, only an inheritable purpose.
             own = UsdGeom.Imageable(prototype).ComputePurposeInfo() if prototype.IsA(UsdGeom.Imageable) else None
             inherited = own if own is not None and own.isInheritable else purpose
-            below.append(_Visit(prototype, inner, np.eye(4), inherited, (*visit.instancers, path)))
-        return below
+            children.append(_PendingPrim(prototype, inner, np.eye(4), inherited, (*pending.instancers, path)))
+        return children

@@ -1,1 +1,1 @@
-"""UsdLux lights, and geometry that is a light."""
+"""UsdLux lights, and gprims that are lights."""

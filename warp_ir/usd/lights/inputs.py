@@ -1,4 +1,4 @@
-"""The inputs of a light."""
+"""Reads the inputs of a light prim."""
 
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
@@ -6,69 +6,74 @@ from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report
 
 
-class Inputs:
-    """A light's inputs; files from before USD 21.02 have them without the prefix ``inputs:``.
+class LightInputs:
+    """Reads a light's inputs; files written before USD 21.02 name them without the prefix ``inputs:``.
 
     Args:
-        prim: With LightAPI.
-        time: Of the values.
-        report: Where troubles go.
+        prim: A prim with LightAPI.
+        time: Time code of all values.
+        report: Receives warnings.
     """
 
     def __init__(self, prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> None:
         self.prim, self.time, self._report = prim, time, report
-        # On a gprim `radius` and the like are geometry.
-        self._may_be_old = not prim.IsA(UsdGeom.Gprim)
+        # Un-prefixed attributes of a gprim, such as `radius`, are geometry.
+        self._may_be_legacy = not prim.IsA(UsdGeom.Gprim)
 
     def attribute(self, name: str) -> Usd.Attribute:
-        """The attribute that holds an input; where it is connected to an interface, the one that it leads to."""
+        """The attribute that holds an input's value, which may be another one that the input is connected to."""
         current = self.prim.GetAttribute(f"inputs:{name}")
-        old = self.prim.GetAttribute(name)
-        if self._may_be_old and old and old.HasAuthoredValue() and not (current and current.HasAuthoredValue()):
-            self.warn("inputs authored in the old style, without 'inputs:', are used")
-            return old
+        legacy = self.prim.GetAttribute(name)
+        if (
+            self._may_be_legacy
+            and legacy
+            and legacy.HasAuthoredValue()
+            and not (current and current.HasAuthoredValue())
+        ):
+            self.warn("legacy inputs without the prefix 'inputs:' are used")
+            return legacy
         if current and current.HasAuthoredConnections():
-            return self._source(current)
+            return self._value_source(current)
         return current
 
-    def _source(self, connected: Usd.Attribute) -> Usd.Attribute:
-        """What gives an input its value, unless that is a shader."""
-        found = UsdShade.Utils.GetValueProducingAttributes(UsdShade.Input(connected))
-        if len(found) == 1 and UsdShade.Input.IsInput(found[0]):
-            return found[0]
-        self.warn(f"{connected.GetName()}: the shader that it is connected to is not read; its own value counts")
+    def _value_source(self, connected: Usd.Attribute) -> Usd.Attribute:
+        """The input that a connection leads to; shaders are not evaluated."""
+        sources = UsdShade.Utils.GetValueProducingAttributes(UsdShade.Input(connected))
+        if len(sources) == 1 and UsdShade.Input.IsInput(sources[0]):
+            return sources[0]
+        self.warn(f"{connected.GetName()}: the connected shader is not evaluated; the input's own value is used")
         return connected
 
     def authored(self, *names: str) -> bool:
-        """Whether a file gives a value to any of these inputs."""
+        """Whether any of these inputs has an authored value."""
         attributes = (self.attribute(name) for name in names)
         return any(attribute and attribute.HasAuthoredValue() for attribute in attributes)
 
     def applied(self, schema: type[Usd.APISchemaBase], *names: str) -> bool:
-        """Whether a schema is applied to the prim. Where it is not, its inputs `names` do not count, and are named."""
+        """Whether a schema is applied to the prim; if not, its inputs `names` are ignored with a warning."""
         applied = bool(self.prim.HasAPI(schema))
-        idle = [] if applied else [name for name in names if self.authored(name)]
-        if idle:
-            self.warn(f"{', '.join(idle)}: ignored, since {schema.__name__} is not applied to the prim")
+        ignored = [] if applied else [name for name in names if self.authored(name)]
+        if ignored:
+            self.warn(f"{', '.join(ignored)}: ignored, since {schema.__name__} is not applied to the prim")
         return applied
 
     def number(self, name: str, default: float) -> float:
-        """A number input."""
+        """An input as a number."""
         return read.number(self.attribute(name), self.time, default)
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """A truth value; False by default, as almost everywhere in UsdLux."""
+        """An input as a truth value; almost all fallbacks of UsdLux are False."""
         return read.flag(self.attribute(name), self.time, default)
 
     def text(self, name: str, default: str = "") -> str:
-        """A token."""
+        """An input as a token."""
         return read.text(self.attribute(name), self.time, default)
 
     def asset(self, name: str) -> Sdf.AssetPath | None:
-        """A file, if one is named."""
+        """An input as an asset; None: it names no file."""
         path = read.raw(self.attribute(name), self.time)
         return path if isinstance(path, Sdf.AssetPath) and path.path != "" else None
 
     def warn(self, what: str) -> None:
-        """Say something about the light."""
+        """Warns, naming the light."""
         self._report.warn(self.prim.GetPath(), what)

@@ -1,9 +1,9 @@
-"""UsdLux lights to `Light` records with their final radiance.
+"""UsdLux lights as `Light` records with their final radiance.
 
     L = intensity · 2^exposure · color · blackbody(colorTemperature) · diffuse · texture · shaping / sizeFactor
 
-with sizeFactor = 1 unless `normalize`, where it is the world-space area (for a distant light the projected
-solid angle), so that the power no longer depends on the size. Nothing is multiplied by metersPerUnit.
+sizeFactor is 1 unless `normalize` is on. Then it is the world-space area (for a distant light the projected solid
+angle), so that the power does not depend on the size. metersPerUnit does not enter.
 """
 
 import math
@@ -17,7 +17,7 @@ from warp_ir.scene import Color, Floats, Light, LightKind
 from warp_ir.usd.images.asset import read_texture
 from warp_ir.usd.images.cache import inherited_color_space
 from warp_ir.usd.images.latlong import LAYOUTS, to_latlong
-from warp_ir.usd.lights.inputs import Inputs
+from warp_ir.usd.lights.inputs import LightInputs
 from warp_ir.usd.lights.shaping import read_shaping
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
@@ -32,21 +32,21 @@ LIGHTS = {
     "DomeLight": LightKind.DOME,
     "DomeLight_1": LightKind.DOME,
 }
-"""The schemas this module reads."""
+"""The light schemas that are read, by their kind."""
 
-BRIGHTEST = 1e30
-"""Radiance beyond this is a mistake in the file, and overflows float32 when it is squared or summed."""
-_PARALLEL = 1e-5
-"""Full angle [degrees] of a distant light below which it is taken as parallel."""
-_THIN = 1e-4
-"""Radius, as a part of the length, of the cylinder that stands for a line."""
-_TEXELS = {LightKind.RECT: 2**20, LightKind.DOME: 2**23}
-"""Pixels to which light textures are averaged down: all that diffuse surfaces can see, and a sun of half a degree."""
-_BRIGHTEST_TEXEL = 1e12
+MAX_RADIANCE = 1e30
+"""Upper limit of radiance; larger values are errors in the file, and overflow float32 when squared or summed."""
+_DELTA_ANGLE = 1e-5
+"""Full angle [degrees] of a distant light below which it is a delta light."""
+_LINE_RADIUS = 1e-4
+"""Radius, relative to the length, of the cylinder that approximates a line light."""
+_MAX_TEXELS = {LightKind.RECT: 2**20, LightKind.DOME: 2**23}
+"""Maximum number of texels: what diffuse surfaces resolve, and for domes a sun of half a degree."""
+_MAX_TEXEL_VALUE = 1e12
 
 
-def emission(inputs: Inputs) -> Floats:
-    """Product intensity · 2^exposure · color · blackbody · diffuse, before any normalisation; float64 [3].
+def unnormalized_radiance(inputs: LightInputs) -> Floats:
+    """The product intensity · 2^exposure · color · blackbody · diffuse, before normalisation; float64 [3].
 
     Raises:
         Unreadable: An input has the wrong type or is not finite.
@@ -56,9 +56,9 @@ def emission(inputs: Inputs) -> Floats:
     if inputs.flag("enableColorTemperature"):
         kelvin = min(max(inputs.number("colorTemperature", 6500.0), 1000.0), 10000.0)
         tint = tint * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
-    exposure = min(inputs.number("exposure", 0.0), 1000.0)  # beyond, 2.0**x raises
+    exposure = min(inputs.number("exposure", 0.0), 1000.0)  # 2.0**1024 raises OverflowError
     radiance: Floats = intensity * 2.0**exposure * inputs.number("diffuse", 1.0) * tint
-    as_color(radiance)
+    checked_radiance(radiance)
     if radiance.min() < 0.0:
         inputs.warn("negative emission clamped to 0")
         radiance = np.maximum(radiance, 0.0)
@@ -68,85 +68,81 @@ def emission(inputs: Inputs) -> Floats:
 def read_light(
     prim: Usd.Prim, kind: LightKind, matrices: Floats, time: Usd.TimeCode, report: Report
 ) -> tuple[Light, ...]:
-    """The records of a light in all its places; none if it emits nothing.
+    """The records of a light in all its instances; those that emit nothing are skipped.
 
     Args:
-        prim: A light of one of `LIGHTS`.
+        prim: A prim of a schema in `LIGHTS`.
         kind: Its kind.
         matrices: world_from_light, [k, 4, 4].
-        time: Of the values.
-        report: Where troubles go.
+        time: Time code of all values.
+        report: Receives warnings.
 
     Raises:
         Unreadable: An input has the wrong type or is not finite.
     """
-    inputs = Inputs(prim, time, report)
-    radiance = emission(inputs)
-    warn_of_unread(inputs)
+    inputs = LightInputs(prim, time, report)
+    radiance = unnormalized_radiance(inputs)
+    warn_unsupported(inputs)
     if radiance.max() == 0.0:
         return ()
     first = Light(
         str(prim.GetPath()),
         kind,
-        as_color(radiance),
+        checked_radiance(radiance),
         texture=light_texture(inputs, kind),
         shaping=read_shaping(inputs, kind),
-        shadows=casts_shadows(inputs),
+        shadows=shadows_enabled(inputs),
     )
-    place = _Placing(inputs, first, radiance)
-    found = (place(matrix) for matrix in matrices)
-    return tuple(light for light in found if light is not None)
+    builder = _LightBuilder(inputs, first, radiance)
+    lights = (builder.at(matrix) for matrix in matrices)
+    return tuple(light for light in lights if light is not None)
 
 
-class _Placing:
-    """A light, its dimensions read once, to be put in many places.
+class _LightBuilder:
+    """Builds the records of a light's instances from inputs that are read once.
 
     Args:
-        inputs: Of the light.
-        light: What is the same everywhere.
-        radiance: Of the light, before any normalisation.
+        inputs: The inputs of the light.
+        light: The record of all instances, without transform and size.
+        radiance: The radiance before normalisation, float64 [3].
     """
 
-    def __init__(self, inputs: Inputs, light: Light, radiance: Floats) -> None:
+    def __init__(self, inputs: LightInputs, light: Light, radiance: Floats) -> None:
         self._inputs, self._light, self._radiance = inputs, light, radiance
         prim, time, kind = inputs.prim, inputs.time, light.kind
-        self._size = {name: abs(inputs.number(name, default)) for name, default in _DIMENSIONS.get(kind, {}).items()}
+        self._size = {
+            name: abs(inputs.number(name, default)) for name, default in _DEFAULT_DIMENSIONS.get(kind, {}).items()
+        }
         self._normalize = inputs.flag("normalize")
         self._as_point = kind == LightKind.SPHERE and read.flag(prim.GetAttribute("treatAsPoint"), time)
         self._as_line = kind == LightKind.CYLINDER and read.flag(prim.GetAttribute("treatAsLine"), time)
         self._angle = min(max(inputs.number("angle", 0.53), 0.0), 360.0) if kind == LightKind.DISTANT else 0.0
 
-    def __call__(self, matrix: Floats) -> Light | None:
-        """The light in one place; None if it emits nothing there.
-
-        Raises:
-            Unreadable: Its emission is not finite.
-        """
+    def at(self, matrix: Floats) -> Light | None:
+        """The light with a transform world_from_light, [4, 4]; None: it emits nothing."""
         light = replace(self._light, world_from_light=matrix)
         if light.kind == LightKind.DOME:
             pole = _dome_from_pole(self._inputs)
             return light if light.texture is None else replace(light, world_from_light=matrix @ pole)
         if light.kind == LightKind.DISTANT:
             return self._distant(light)
-        return self._shape(light)
+        return self._area_light(light)
 
     def _distant(self, light: Light) -> Light:
+        """A distant light, normalised by its projected solid angle."""
         angle, radiance = self._angle, self._radiance
         solid_angle = projected_solid_angle(angle)
-        if angle < _PARALLEL:
-            angle, radiance = 0.0, radiance if self._normalize else radiance * solid_angle  # now an irradiance
+        if angle < _DELTA_ANGLE:
+            angle = 0.0
+            radiance = radiance if self._normalize else radiance * solid_angle  # of a delta light: its irradiance
         elif self._normalize:
             radiance = radiance / solid_angle
-        return replace(light, radiance=as_color(radiance), angle=angle)
+        return replace(light, radiance=checked_radiance(radiance), angle=angle)
 
-    def _shape(self, light: Light) -> Light | None:
-        inputs, kind, size, radiance, normalize = (
-            self._inputs,
-            light.kind,
-            dict(self._size),
-            self._radiance,
-            self._normalize,
-        )
+    def _area_light(self, light: Light) -> Light | None:
+        """A light with an area, or the limit of one: a point light, or a thin cylinder for a line light."""
+        inputs, kind, size = self._inputs, light.kind, dict(self._size)
+        radiance, normalize = self._radiance, self._normalize
         matrix = light.world_from_light
         area = _AREA[kind](matrix, size)
         if self._as_point or (kind == LightKind.SPHERE and size["radius"] == 0.0):
@@ -154,11 +150,11 @@ class _Placing:
                 inputs.warn("a sphere light of radius 0 emits nothing; rendered as if 'normalize' were on")
             # A sphere of area A has the intensity L A / 4 in every direction, whatever its radius.
             intensity = radiance * (1.0 if normalize or area == 0.0 else area) / 4.0
-            return replace(light, kind=LightKind.POINT, radiance=as_color(intensity))
+            return replace(light, kind=LightKind.POINT, radiance=checked_radiance(intensity))
         if self._as_line or (kind == LightKind.CYLINDER and normalize and size["radius"] == 0.0):
-            # The limit of a thin cylinder of the same power: closer to it than anything that is not on it can see.
+            # A thin cylinder of the same power; the error is below what any receiver off the light resolves.
             power = 1.0 if normalize or area == 0.0 else area
-            size["radius"] = _THIN * size["length"]
+            size["radius"] = _LINE_RADIUS * size["length"]
             area = _AREA[kind](matrix, size)
             radiance, normalize = radiance * power, True
         if not (math.isfinite(area) and area > 0.0):
@@ -168,7 +164,7 @@ class _Placing:
             radiance = radiance / area
         return replace(
             light,
-            radiance=as_color(radiance),
+            radiance=checked_radiance(radiance),
             width=size.get("width", 1.0),
             height=size.get("height", 1.0),
             radius=size.get("radius", 0.5),
@@ -176,35 +172,35 @@ class _Placing:
         )
 
 
-def light_texture(inputs: Inputs, kind: LightKind) -> Floats | None:
-    """The image that multiplies a light's radiance, float32 [h, w, 3], as `Light` wants it."""
+def light_texture(inputs: LightInputs, kind: LightKind) -> Floats | None:
+    """The texture that multiplies a light's radiance, float32 [h, w, 3], as `Light` takes it; None: it has none."""
     asset = inputs.asset("texture:file")
     if asset is None:
         return None
     if kind not in (LightKind.RECT, LightKind.DOME):
-        inputs.warn("only rectangles and domes have textures; this one is ignored")
+        inputs.warn("only RectLight and DomeLight have textures; this one is ignored")
         return None
     layout = inputs.text("texture:format", "automatic") if kind == LightKind.DOME else "latlong"
     if layout not in ("automatic", "latlong", *LAYOUTS):
-        inputs.warn(f"texture:format: '{layout}' is no layout; read as latlong")
+        inputs.warn(f"texture:format: '{layout}' is unknown; it is read as latlong")
     attribute = inputs.attribute("texture:file")
     space = str(attribute.GetColorSpace() or "auto")
     try:
-        image = read_texture(asset, space, _TEXELS[kind])
+        image = read_texture(asset, space, _MAX_TEXELS[kind])
         inherited = inherited_color_space(attribute, image) if space == "auto" else ""
-        image = read_texture(asset, inherited, _TEXELS[kind]) if inherited else image
+        image = read_texture(asset, inherited, _MAX_TEXELS[kind]) if inherited else image
         primaries = color_space(inherited or space)
         pixels = to_latlong(image.rgb, layout) if layout in LAYOUTS else image.rgb
     except Unreadable as trouble:
-        inputs.warn(f"texture:file: {trouble}; it emits its constant colour")
+        inputs.warn(f"texture:file: {trouble}; its constant colour is used")
         return None
     if primaries is not None:
         pixels = pixels @ rgb_conversion_matrix(primaries, None).T.astype(np.float32)
-    return np.clip(pixels, 0.0, _BRIGHTEST_TEXEL)
+    return np.clip(pixels, 0.0, _MAX_TEXEL_VALUE)
 
 
-def _dome_from_pole(inputs: Inputs) -> Floats:
-    """dome_from_texture, [4, 4]: a texture's pole is +Y; DomeLight_1 may have it along +Z, as its poleAxis says."""
+def _dome_from_pole(inputs: LightInputs) -> Floats:
+    """dome_from_texture, [4, 4]; the pole of a texture is +Y, and that of DomeLight_1 may be +Z (poleAxis)."""
     axis = read.text(inputs.prim.GetAttribute("poleAxis"), inputs.time, "Y")
     if axis == "scene":
         axis = str(UsdGeom.GetStageUpAxis(inputs.prim.GetStage()))
@@ -214,7 +210,7 @@ def _dome_from_pole(inputs: Inputs) -> Floats:
 
 
 def projected_solid_angle(angle: float) -> float:
-    """Irradiance of a surface that faces a distant light of radiance 1 and this full angle [degrees]; 1 for 0."""
+    """Irradiance of a surface facing a distant light of radiance 1 and this full angle [degrees]; 1 for angle 0."""
     theta = math.radians(min(max(0.5 * angle, 0.0), 180.0))
     if theta == 0.0:
         return 1.0
@@ -222,8 +218,8 @@ def projected_solid_angle(angle: float) -> float:
     return math.pi * (sine2 if theta <= 0.5 * math.pi else 2.0 - sine2)
 
 
-def casts_shadows(inputs: Inputs) -> bool:
-    """What ShadowAPI says of it.
+def shadows_enabled(inputs: LightInputs) -> bool:
+    """Whether the light casts shadows, by ShadowAPI's shadow:enable.
 
     Raises:
         Unreadable: shadow:enable has the wrong type.
@@ -231,8 +227,8 @@ def casts_shadows(inputs: Inputs) -> bool:
     return not inputs.applied(UsdLux.ShadowAPI, "shadow:enable") or inputs.flag("shadow:enable", True)
 
 
-def warn_of_unread(inputs: Inputs) -> None:
-    """Name what a light asks for and this loader does not read.
+def warn_unsupported(inputs: LightInputs) -> None:
+    """Warns of inputs and filters of a light that are not supported.
 
     Raises:
         Unreadable: An input has the wrong type or is not finite.
@@ -241,25 +237,25 @@ def warn_of_unread(inputs: Inputs) -> None:
     if prim.HasAPI(UsdLux.ShadowAPI):
         color = read.color(inputs.attribute("shadow:color"), inputs.time, (0.0, 0.0, 0.0))
         if any(color) or inputs.number("shadow:distance", -1.0) >= 0.0:
-            inputs.warn("colour, distance and falloff of shadows are not read: they are black and reach everywhere")
-    old = prim.GetRelationship("filters")
-    if read.targets(UsdLux.LightAPI(prim).GetFiltersRel()) or (old and read.targets(old)):
-        inputs.warn("light filters are not read")
+            inputs.warn("colour, distance and falloff of shadows are not supported: shadows are black and unlimited")
+    legacy = prim.GetRelationship("filters")
+    if read.targets(UsdLux.LightAPI(prim).GetFiltersRel()) or (legacy and read.targets(legacy)):
+        inputs.warn("light filters are not supported")
 
 
-def as_color(radiance: Floats) -> Color:
+def checked_radiance(radiance: Floats) -> Color:
     """A radiance [3] as a tuple.
 
     Raises:
-        Unreadable: It is not finite, or so large that a tiny area must have divided it.
+        Unreadable: It is not finite, or too large, for example after division by a tiny area.
     """
-    if not np.abs(radiance).max() < BRIGHTEST:
-        raise Unreadable(f"its emission exceeds {BRIGHTEST:g}")
+    if not np.abs(radiance).max() < MAX_RADIANCE:
+        raise Unreadable(f"its emission exceeds {MAX_RADIANCE:g}")
     red, green, blue = radiance.tolist()
     return red, green, blue
 
 
-_DIMENSIONS: dict[LightKind, dict[str, float]] = {
+_DEFAULT_DIMENSIONS: dict[LightKind, dict[str, float]] = {
     LightKind.RECT: {"width": 1.0, "height": 1.0},
     LightKind.DISK: {"radius": 0.5},
     LightKind.SPHERE: {"radius": 0.5},
@@ -283,14 +279,14 @@ def _disk_area(matrix: Floats, size: dict[str, float]) -> float:
 
 
 def _sphere_area(matrix: Floats, size: dict[str, float]) -> float:
-    """Thomsen's formula for an ellipsoid, exact for a sphere."""
+    """Thomsen's formula for the area of an ellipsoid, exact for a sphere."""
     a, b, c = (size["radius"] * axis for axis in _axes(matrix))
     mean: float = (((a * b) ** 1.6 + (a * c) ** 1.6 + (b * c) ** 1.6) / 3.0) ** (1.0 / 1.6)
     return 4.0 * math.pi * mean
 
 
 def _cylinder_area(matrix: Floats, size: dict[str, float]) -> float:
-    """Of the side alone; Ramanujan's perimeter of an ellipse, exact for a circle."""
+    """Area of the side without caps, with Ramanujan's perimeter of an ellipse, exact for a circle."""
     x, y, z = _axes(matrix)
     a, b = size["radius"] * y, size["radius"] * z
     perimeter = math.pi * (3.0 * (a + b) - math.sqrt((3.0 * a + b) * (a + 3.0 * b)))

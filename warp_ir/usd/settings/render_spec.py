@@ -1,4 +1,4 @@
-"""What a stage wants of a render: its RenderSettings prim, products and variables (UsdRender)."""
+"""RenderSettings, RenderProduct and RenderVar prims (UsdRender) as records."""
 
 import re
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.source_color_space import color_space
 
-_OURS = "warp_ir:"
+_NAMESPACE = "warp_ir:"
 """Namespace of attributes that are fields of `RenderSettings`."""
 _FIELDS = {f.name: f for f in fields(RenderSettings)}
-_COLOR = {"color", "ci", "c", "beauty", "rgba", "rgb"}
-"""Names of the picture itself."""
+_COLOR_NAMES = {"color", "ci", "c", "beauty", "rgba", "rgb"}
+"""Names of RenderVars that mean the colour, in lower case."""
 _AOVS = {
     **dict.fromkeys(("alpha", "a", "opacity"), "alpha"),
     **dict.fromkeys(("depth", "z", "cameradepth", "lineardepth"), "depth"),
@@ -30,47 +30,47 @@ _AOVS = {
     **{name: name for name in ("direct", "indirect")},
     **dict.fromkeys(("primid", "prim_id", "id"), "prim_id"),
 }
-"""What other renderers call the AOVs that a film has, in lower case."""
+"""The AOVs of a film by names that renderers use for them, in lower case."""
 
 
 @dataclass(frozen=True)
 class Product:
-    """A picture that the stage wants."""
+    """A picture that a RenderProduct describes."""
 
     path: str = ""
-    """Of the RenderProduct; "" if the settings have none."""
+    """Path of the RenderProduct; "" if the settings have none."""
     name: str = ""
-    """Of the file, without a folder: a stage does not say where to write."""
+    """Name of the file without its directory: a stage does not decide where files are written."""
     camera: str = ""
     """Path of its camera; "" if none is named."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of `RenderSettings`."""
+    """Values for fields of `RenderSettings`."""
     aovs: tuple[str, ...] = ()
-    """What it wants beside the colour."""
+    """AOVs in addition to the colour."""
 
 
 @dataclass(frozen=True)
 class RenderSpec:
-    """What the stage's RenderSettings ask for."""
+    """The content of a RenderSettings prim."""
 
     path: str = ""
-    """Of the prim; "" if the stage has none."""
+    """Path of the prim; "" if the stage has none."""
     purposes: tuple[str, ...] | None = None
-    """What to draw, if that is authored."""
+    """Purposes to draw; None: not authored."""
     material_purposes: tuple[str, ...] = PURPOSES[:2]
-    """Of the bindings of materials, in the order in which they are wanted."""
+    """Purposes of material bindings, in order of preference."""
     products: tuple[Product, ...] = (Product(),)
-    """At least one."""
+    """The products, at least one."""
 
 
 def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, report: Report) -> RenderSpec:
-    """The settings that are named, else those of the stage's metadata, else the first there are.
+    """The named settings, else those that the stage's metadata name, else the first.
 
     Args:
         stage: The stage.
-        name: Path of a RenderSettings prim; None to choose.
-        time: Of the values.
-        report: Where troubles and guesses go.
+        name: Path or name of a RenderSettings prim; None to choose.
+        time: Time code of all values.
+        report: Receives warnings.
 
     Raises:
         InputError: There are no settings of that name.
@@ -78,7 +78,7 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
     chosen = _choose(stage, name, report)
     if chosen is None:
         return RenderSpec()
-    base = {**_fields(chosen, time, report, everything=True), **_color_space(chosen, time, report)}
+    base = {**_fields(chosen, time, report, fallbacks=True), **_color_space(chosen, time, report)}
     camera = _camera(chosen, report)
     products = []
     for path in read.targets(UsdRender.Settings(chosen).GetProductsRel()):
@@ -94,7 +94,7 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
                 str(path),
                 _file_name(prim, time, report),
                 _camera(prim, report) or camera,
-                {**base, **_fields(prim, time, report, everything=False)},
+                {**base, **_fields(prim, time, report, fallbacks=False)},
                 _aovs(stage, prim, time, report),
             )
         )
@@ -102,45 +102,46 @@ def read_render_spec(stage: Usd.Stage, name: str | None, time: Usd.TimeCode, rep
     names = read.tokens(purposes, time) if purposes.HasAuthoredValue() else []
     known = tuple(name for name in names if name in UsdGeom.Imageable.GetOrderedPurposeTokens())
     bindings = UsdRender.Settings(chosen).GetMaterialBindingPurposesAttr()
-    looks = read.tokens(bindings, time) if bindings.HasAuthoredValue() else PURPOSES[:2]
-    # The schema calls "" so in a sentence, and many files quote it.
-    looks = ["" if name == "allPurpose" else name for name in looks]
-    if strange := [name for name in looks if name and not Sdf.Path.IsValidIdentifier(name)]:
-        report.warn(chosen.GetPath(), f"materialBindingPurposes: {strange} cannot be purposes and are ignored")
+    material_purposes = read.tokens(bindings, time) if bindings.HasAuthoredValue() else PURPOSES[:2]
+    # The schema's documentation calls "" by this name, and files use it as a value.
+    material_purposes = ["" if name == "allPurpose" else name for name in material_purposes]
+    if invalid := [name for name in material_purposes if name and not Sdf.Path.IsValidIdentifier(name)]:
+        report.warn(chosen.GetPath(), f"materialBindingPurposes: {invalid} are no purposes and are ignored")
     return RenderSpec(
         str(chosen.GetPath()),
         known or None,
-        tuple(name for name in looks if name not in strange),
+        tuple(name for name in material_purposes if name not in invalid),
         tuple(products) or (Product(camera=camera, settings=base),),
     )
 
 
 def render_settings_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """All RenderSettings of a stage."""
+    """All RenderSettings prims of a stage."""
     return [prim for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
 
 
 def _choose(stage: Usd.Stage, name: str | None, report: Report) -> Usd.Prim | None:
-    there = render_settings_prims(stage)
+    """The RenderSettings prim to use; None: the stage has none."""
+    prims = render_settings_prims(stage)
     if name is not None:
-        found = next((prim for prim in there if name in (str(prim.GetPath()), prim.GetName())), None)
-        if found is None:
-            paths = ", ".join(str(prim.GetPath()) for prim in there) or "none"
+        chosen = next((prim for prim in prims if name in (str(prim.GetPath()), prim.GetName())), None)
+        if chosen is None:
+            paths = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
             raise InputError(f"{report.source}: no render settings '{name}'; available: {paths}")
-        return found
-    wanted = stage.GetMetadata("renderSettingsPrimPath") if stage.HasAuthoredMetadata("renderSettingsPrimPath") else ""
-    if wanted:
-        found = next((prim for prim in there if str(prim.GetPath()) == str(wanted)), None)
-        if found is not None:
-            return found
-        report.warn("/", f"renderSettingsPrimPath {wanted} is not a RenderSettings prim of the stage")
-    if len(there) > 1:
-        report.warn(there[0].GetPath(), f"used because they are the first of {len(there)} render settings")
-    return there[0] if there else None
+        return chosen
+    has_default = stage.HasAuthoredMetadata("renderSettingsPrimPath")
+    if has_default and (default := str(stage.GetMetadata("renderSettingsPrimPath"))):
+        chosen = next((prim for prim in prims if str(prim.GetPath()) == default), None)
+        if chosen is not None:
+            return chosen
+        report.warn("/", f"renderSettingsPrimPath {default} is not a RenderSettings prim of the stage")
+    if len(prims) > 1:
+        report.warn(prims[0].GetPath(), f"used because they are the first of {len(prims)} render settings")
+    return prims[0] if prims else None
 
 
 def _camera(prim: Usd.Prim, report: Report) -> str:
-    """The camera that settings or a product name."""
+    """Path of the camera that RenderSettings or a RenderProduct name; "" if there is none."""
     for path in read.targets(UsdRender.SettingsBase(prim).GetCameraRel()):
         target = prim.GetStage().GetPrimAtPath(path)
         if target and target.IsA(UsdGeom.Camera):
@@ -149,64 +150,71 @@ def _camera(prim: Usd.Prim, report: Report) -> str:
     return ""
 
 
-def _fields(prim: Usd.Prim, time: Usd.TimeCode, report: Report, *, everything: bool) -> dict[str, Any]:
-    """Fields of `RenderSettings` that a prim sets: of a product only what is authored, of settings fallbacks too."""
+def _fields(prim: Usd.Prim, time: Usd.TimeCode, report: Report, *, fallbacks: bool) -> dict[str, Any]:
+    """Fields of `RenderSettings` that a prim sets.
+
+    Args:
+        prim: A RenderSettings or RenderProduct prim.
+        time: Time code of all values.
+        report: Receives warnings.
+        fallbacks: Whether the schema's fallbacks count; of a product only authored values override the settings.
+    """
     base = UsdRender.SettingsBase(prim)
-    wanted: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
 
-    def take(attribute: Usd.Attribute, *names: str) -> None:
-        if everything or attribute.HasAuthoredValue():
-            found = read.raw(attribute, time)
-            parts = tuple(found) if isinstance(found, Gf.Vec2i | Gf.Vec4f) else (found,)
-            for name, part in zip(names, parts if len(names) > 1 else (found,), strict=False):
-                _accept(wanted, name, part, attribute, report)
+    def set_fields(attribute: Usd.Attribute, *names: str) -> None:
+        if fallbacks or attribute.HasAuthoredValue():
+            value = read.raw(attribute, time)
+            parts = tuple(value) if isinstance(value, Gf.Vec2i | Gf.Vec4f) else (value,)
+            for name, part in zip(names, parts if len(names) > 1 else (value,), strict=False):
+                _set_field(settings, name, part, attribute, report)
 
-    take(base.GetResolutionAttr(), "width", "height")
-    take(base.GetPixelAspectRatioAttr(), "pixel_aspect")
-    take(base.GetAspectRatioConformPolicyAttr(), "conform")
-    take(base.GetDataWindowNDCAttr(), "data_window")
+    set_fields(base.GetResolutionAttr(), "width", "height")
+    set_fields(base.GetPixelAspectRatioAttr(), "pixel_aspect")
+    set_fields(base.GetAspectRatioConformPolicyAttr(), "conform")
+    set_fields(base.GetDataWindowNDCAttr(), "data_window")
     for attribute, name in (
         (base.GetInstantaneousShutterAttr(), "motion_blur"),
         (base.GetDisableMotionBlurAttr(), "motion_blur"),
         (base.GetDisableDepthOfFieldAttr(), "depth_of_field"),
     ):
         if attribute.HasAuthoredValue():
-            wanted[name] = not read.flag(attribute, time) and wanted.get(name, True)
-    for attribute in prim.GetAuthoredPropertiesInNamespace(_OURS):
+            settings[name] = not read.flag(attribute, time) and settings.get(name, True)
+    for attribute in prim.GetAuthoredPropertiesInNamespace(_NAMESPACE):
         if isinstance(attribute, Usd.Attribute):
-            name = _snake(attribute.GetName().removeprefix(_OURS))
+            name = _snake_case(attribute.GetName().removeprefix(_NAMESPACE))
             if name not in _FIELDS:
-                report.warn(prim.GetPath(), f"{attribute.GetName()} is no setting of warp_ir")
+                report.warn(prim.GetPath(), f"{attribute.GetName()} is not a setting of warp_ir")
             else:
-                _accept(wanted, name, read.raw(attribute, time), attribute, report)
-    return wanted
+                _set_field(settings, name, read.raw(attribute, time), attribute, report)
+    return settings
 
 
-def _accept(wanted: dict[str, Any], name: str, found: Any, attribute: Usd.Attribute, report: Report) -> None:
-    """Notes a value if it is a possible one."""
-    if isinstance(found, Gf.Vec4f | Gf.Vec4d):
-        found = tuple(round(float(x), 7) for x in found)  # authored in decimals, stored in binary
-    if isinstance(found, float) and not isinstance(_FIELDS[name].default, bool) and name == "pixel_aspect":
-        found = round(found, 7)
+def _set_field(settings: dict[str, Any], name: str, value: Any, attribute: Usd.Attribute, report: Report) -> None:
+    """Sets a field if the value is valid; warns otherwise."""
+    if isinstance(value, Gf.Vec4f | Gf.Vec4d):
+        value = tuple(round(float(x), 7) for x in value)  # restores the authored decimals, which are stored as float32
+    if isinstance(value, float) and not isinstance(_FIELDS[name].default, bool) and name == "pixel_aspect":
+        value = round(value, 7)
     try:
-        RenderSettings(**{name: found})
+        RenderSettings(**{name: value})
     except (InputError, TypeError) as trouble:
-        reason = str(trouble).partition(": ")[2] or f"is a {type(found).__name__}"
+        reason = str(trouble).partition(": ")[2] or f"is a {type(value).__name__}"
         report.warn(attribute.GetPrim().GetPath(), f"{attribute.GetName()} {reason}; the default is used")
         return
     if isinstance(_FIELDS[name].default, bool):
-        found = bool(found)
-    wanted[name] = found
+        value = bool(value)
+    settings[name] = value
 
 
-def _snake(name: str) -> str:
+def _snake_case(name: str) -> str:
     """`lightPaths` or `light_paths` -> `light_paths`."""
     return re.sub(r"(?<=[a-z])([A-Z])", lambda match: "_" + match[1].lower(), name)
 
 
 def _aovs(stage: Usd.Stage, product: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[str, ...]:
-    """The AOVs that a product's orderedVars name, the colour apart."""
-    found: dict[str, None] = {}
+    """The AOVs that a product's orderedVars name, without the colour."""
+    aovs: dict[str, None] = {}
     unknown: dict[Sdf.Path, str] = {}
     for path in read.targets(UsdRender.Product(product).GetOrderedVarsRel()):
         prim = stage.GetPrimAtPath(path)
@@ -218,26 +226,26 @@ def _aovs(stage: Usd.Stage, product: Usd.Prim, time: Usd.TimeCode, report: Repor
         if read.text(var.GetSourceTypeAttr(), time, "raw") == "lpe":
             source = re.sub(r"^C\.\*$", "color", source.replace(" ", "").removeprefix("lpe:"))
         name = source.lower()
-        if name in _COLOR:
+        if name in _COLOR_NAMES:
             continue
         if name in _AOVS:
-            found[_AOVS[name]] = None
+            aovs[_AOVS[name]] = None
         else:
             unknown[path] = f"'{source}'"
     for path in unknown:
-        report.warn(path, f"there is no variable {', '.join(dict.fromkeys(unknown.values()))} to write; left out")
-    return tuple(found)
+        report.warn(path, f"no AOV for the variable {', '.join(dict.fromkeys(unknown.values()))}; it is skipped")
+    return tuple(aovs)
 
 
 def _file_name(product: Usd.Prim, time: Usd.TimeCode, report: Report) -> str:
-    """The product's name without its folder; the prim's name if it has none."""
+    """The file name of a product without its directory; the prim's name if there is none."""
     try:
         authored = str(read.raw(UsdRender.Product(product).GetProductNameAttr(), time) or "")
     except Tf.ErrorException:
         authored = ""
     base = PureWindowsPath(PurePosixPath(authored).name).name
     if base != authored and base:
-        report.warn(product.GetPath(), f"of productName '{authored}' only '{base}' counts: a stage names no folders")
+        report.warn(product.GetPath(), f"only '{base}' of productName '{authored}' is used: directories are ignored")
     base = "".join(letter for letter in base if letter.isprintable()).strip()
     if base in ("", ".", ".."):
         base = product.GetName()
@@ -245,7 +253,7 @@ def _file_name(product: Usd.Prim, time: Usd.TimeCode, report: Report) -> str:
 
 
 def _color_space(settings: Usd.Prim, time: Usd.TimeCode, report: Report) -> dict[str, Any]:
-    """The field of `RenderSettings` that renderingColorSpace sets: the colour space of what is written."""
+    """The field `color_space` that renderingColorSpace sets: the colour space of written pictures."""
     name = read.text(UsdRender.Settings(settings).GetRenderingColorSpaceAttr(), time)
     try:
         space = color_space(name)
@@ -255,7 +263,7 @@ def _color_space(settings: Usd.Prim, time: Usd.TimeCode, report: Report) -> dict
     if space is None:
         return {}
     if space.GetName() not in COLOR_SPACES:
-        report.warn(settings.GetPath(), f"renderingColorSpace '{name}' is not linear, or not known; Rec. 709 is used")
+        report.warn(settings.GetPath(), f"renderingColorSpace '{name}' is unknown or not linear; Rec. 709 is used")
         return {}
     report.warn(
         settings.GetPath(),

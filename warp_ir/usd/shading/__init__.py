@@ -1,1 +1,1 @@
-"""Materials: which is bound, and the diffuse, emissive and opacity part of its shader network."""
+"""Material bindings, and the diffuse, emissive and opacity part of shading networks."""

@@ -1,6 +1,7 @@
-"""Materials in .mdl files that are a known one with other arguments, as Omniverse's libraries and converters have it.
+"""Materials in .mdl files that call a known material with other arguments, as Omniverse's libraries and tools write.
 
-MDL is a language. Of it one form is read: `export material NAME(*) = OmniPBR(diffuse_texture: texture_2d("a.png"), …);`
+MDL is a language. Only this form is read:
+`export material NAME(*) = OmniPBR(diffuse_texture: texture_2d("a.png"), …);`
 """
 
 import math
@@ -10,67 +11,67 @@ from dataclasses import dataclass, field
 
 from pxr import Ar, Sdf, Tf
 
-_MOST_BYTES = 2**17
-"""Such files are short; what is longer is a program."""
+_MAX_BYTES = 2**17
+"""Maximum size of a file; such files are short, longer ones are programs."""
 _STRING = r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)'
 _COMMENT = r"/\*(?:.*?\*/|.*)|//[^\n]*"
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-# Nothing here matches the same in two ways, which a text could be made for that takes forever.
+# The pattern is unambiguous: a crafted text cannot make it backtrack exponentially.
 _NUMBERS = re.compile(rf"(?:(?:color|float[234]?|int|bool)\s*\()?\s*{_NUMBER}f?\s*(?:,\s*{_NUMBER}f?\s*)*\)?")
 
 
 @dataclass(frozen=True)
-class Call:
-    """A material that another one is called with."""
+class MdlCall:
+    """A call of a material, with its constant arguments by name."""
 
     name: str
-    """Of the other one, without its module."""
+    """The called material, without its module."""
     numbers: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    """Its arguments: numbers, colours, vectors, truth values."""
-    words: dict[str, str] = field(default_factory=dict)
+    """Numbers, colours, vectors and truth values."""
+    constants: dict[str, str] = field(default_factory=dict)
     """Names of constants."""
     files: dict[str, tuple[Sdf.AssetPath, str]] = field(default_factory=dict)
-    """Textures, and what they are said to hold: "sRGB", "raw" or "auto"."""
+    """Textures with their gamma: "sRGB", "raw" or "auto"."""
 
 
-def read_call(asset: Sdf.AssetPath, name: str) -> Call | None:
-    """What a material of an .mdl file calls; None if there is no such file, or it says more than that."""
-    text = _text(asset.resolvedPath)
+def read_mdl_call(asset: Sdf.AssetPath, name: str) -> MdlCall | None:
+    """The call that defines a material of an .mdl file; None: there is no such file, or it has another form."""
+    text = _source_without_comments(asset.resolvedPath)
     head = re.search(rf"export\s+material\s+{re.escape(name)}\s*\(\s*\*\s*\)\s*", text)
     if head is None:
         return None
     begin = head.end()
     if text.startswith("[[", begin):  # annotations
         begin = text.find("]]", begin) + 2
-    found = re.compile(r"\s*=\s*(?:\w*::)*(\w+)\s*\(").match(text, begin)
-    if found is None:
+    head_of_call = re.compile(r"\s*=\s*(?:\w*::)*(\w+)\s*\(").match(text, begin)
+    if head_of_call is None:
         return None
-    call = Call(found[1])
-    for argument in _arguments(text[found.end() :]):
+    call = MdlCall(head_of_call[1])
+    for argument in _arguments(text[head_of_call.end() :]):
         key, colon, value = argument.partition(":")
         if colon:
-            _take(call, key.strip(), value.strip(), asset.resolvedPath)
+            _add_argument(call, key.strip(), value.strip(), asset.resolvedPath)
     return call
 
 
-def _text(source: str) -> str:
-    """A file's text without its comments; "" if there is none, or too much of it."""
-    if not source or (os.path.exists(source) and not os.path.isfile(source)):
+def _source_without_comments(mdl_path: str) -> str:
+    """The text of a file without comments; "" if there is none or it is too large."""
+    if not mdl_path or (os.path.exists(mdl_path) and not os.path.isfile(mdl_path)):
         return ""
     try:
-        opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source))
-        content = opened.GetBuffer() if opened and opened.GetSize() <= _MOST_BYTES else None
+        opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(mdl_path))
+        content = opened.GetBuffer() if opened and opened.GetSize() <= _MAX_BYTES else None
     except Tf.ErrorException:
         return ""
     whole = bytes(content or b"").decode("utf-8", "replace")
-    # A string may look like a comment.
+    # Strings may contain comment marks.
     return re.sub(
-        f"{_STRING}|{_COMMENT}", lambda found: found[0] if found[0][0] == '"' else " ", whole, flags=re.DOTALL
+        f"{_STRING}|{_COMMENT}", lambda match: match[0] if match[0][0] == '"' else " ", whole, flags=re.DOTALL
     )
 
 
 def _arguments(text: str) -> list[str]:
-    """What stands between commas up to the parenthesis that closes what is open."""
+    """The arguments of a call: split at commas, up to the closing parenthesis."""
     depth, parts = 0, [""]
     for piece in re.findall(f"{_STRING}|.", text, re.DOTALL):
         if piece in "([{":
@@ -86,12 +87,12 @@ def _arguments(text: str) -> list[str]:
     return parts
 
 
-def _take(call: Call, key: str, value: str, source: str) -> None:
-    """Notes an argument, if it is a constant."""
+def _add_argument(call: MdlCall, key: str, value: str, mdl_path: str) -> None:
+    """Stores an argument, if it is constant."""
     texture = re.match(r'texture_2d\s*\(\s*"([^"]+)"(.*)', value, re.DOTALL)
     if texture is not None:
         space = "sRGB" if "gamma_srgb" in texture[2] else "raw" if "gamma_linear" in texture[2] else "auto"
-        call.files[key] = _asset(texture[1], source), space
+        call.files[key] = _resolved_asset(texture[1], mdl_path), space
     elif _NUMBERS.fullmatch(value):
         numbers = tuple(float(number) for number in re.findall(_NUMBER, value.partition("(")[2] or value))
         if all(math.isfinite(number) for number in numbers):
@@ -99,11 +100,11 @@ def _take(call: Call, key: str, value: str, source: str) -> None:
     elif value in ("true", "false"):
         call.numbers[key] = (float(value == "true"),)
     elif re.fullmatch(r"[\w:]+", value):
-        call.words[key] = value.rpartition("::")[2]
+        call.constants[key] = value.rpartition("::")[2]
 
 
-def _asset(path: str, source: str) -> Sdf.AssetPath:
-    """A file that is named relative to another."""
+def _resolved_asset(path: str, mdl_path: str) -> Sdf.AssetPath:
+    """The asset of a path relative to the .mdl file."""
     relative = path if os.path.isabs(path) or path.startswith(("./", "../")) else f"./{path}"
-    identifier = Ar.GetResolver().CreateIdentifier(relative, Ar.ResolvedPath(source))
+    identifier = Ar.GetResolver().CreateIdentifier(relative, Ar.ResolvedPath(mdl_path))
     return Sdf.AssetPath(path, str(Ar.GetResolver().Resolve(identifier)))

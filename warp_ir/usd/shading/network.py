@@ -1,8 +1,7 @@
-"""Networks of shading nodes, evaluated: what an input of a surface shader gets."""
+"""Shading networks: evaluates the inputs of surface shaders through the nodes that are connected to them."""
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
@@ -23,37 +22,37 @@ from warp_ir.usd.shading.vendor_shaders import shader_name
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Unreadable
 
-_DEPTH = 32
-"""Longest chain of nodes that is followed."""
-_NODE_BUDGET = 256
-"""Most nodes that one input may need: shared nodes count every time they are used."""
+_MAX_DEPTH = 32
+"""Maximum length of a chain of connected nodes."""
+_MAX_NODES = 256
+"""Maximum number of node evaluations per input; shared nodes count every time."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
-_READERS = {"UsdPrimvarReader": ("varname", "fallback"), "geompropvalue": ("geomprop", "default")}
-"""Nodes that read primvars: their inputs for its name, and for the value where there is none."""
+_PRIMVAR_READERS = {"UsdPrimvarReader": ("varname", "fallback"), "geompropvalue": ("geomprop", "default")}
+"""Nodes that read primvars, with their inputs for the primvar's name and for its fallback."""
 _CHANNELS = {
     **dict.fromkeys(("float", "int", "integer"), 1),
     **dict.fromkeys(("float2", "vector2"), 2),
     **dict.fromkeys(("float3", "vector3", "color3", "normal", "point", "vector"), 3),
     **dict.fromkeys(("float4", "vector4", "color4"), 4),
 }
-"""Of what they read."""
-_FOREIGN_IMAGES = {
+"""Number of channels by type of the primvar."""
+_VENDOR_IMAGES = {
     **dict.fromkeys(("arnold:image", "image", "PxrTexture"), "filename"),
     "gltf_texture_lookup": "texture",
     "file_texture": "texture",
     "lookup_color": "tex",
 }
-"""Other renderers' nodes that read images: their inputs for the file."""
+"""Vendors' nodes that read images, with their inputs for the file."""
 _MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
 
 
-class Network:
+class ShadingNetwork:
     """Evaluates the inputs of shading nodes.
 
     Args:
-        images: Of the scene.
-        material: Named in warnings.
-        time: Of the values.
+        images: Cache of images.
+        material: Path of the material, named in warnings.
+        time: Time code of all values.
     """
 
     def __init__(self, images: ImageCache, material: object, time: Usd.TimeCode) -> None:
@@ -62,39 +61,42 @@ class Network:
         self._nodes = 0
 
     def warn(self, what: str) -> None:
-        """Say something about the material."""
+        """Warns, naming the material."""
         self._images.report.warn(self.material, what)
 
-    def texture(self, signal: ShadingValue) -> Texture:
-        """A signal that has a place, as a texture."""
-        return self._images.texture(signal)
+    def texture(self, value: ShadingValue) -> Texture:
+        """An image with texture coordinates as a `Texture`."""
+        return self._images.texture(value)
 
     def evaluate(self, shader_input: UsdShade.Input, default: ShadingValue) -> ShadingValue:
-        """What a shader's input gets; the default where nothing is authored, or where it cannot be read."""
+        """The value of a shader's input; the default if nothing is authored or it cannot be read."""
         self._nodes = 0
         try:
-            return self._input(shader_input, default, _DEPTH)
+            return self._input(shader_input, default, _MAX_DEPTH)
         except Unreadable as trouble:
             self.warn(f"{shader_input.GetBaseName()}: {trouble}; the default is used")
             return default
 
-    def word(self, shader_input: UsdShade.Input) -> str:
-        """A token that an input holds, or a number in digits; "" where there is none."""
+    def token(self, shader_input: UsdShade.Input) -> str:
+        """An input as a token, numbers converted to text; "" if it has no value."""
         attribute = read.producer(shader_input)
-        found = None if attribute is None else read.raw(attribute, self._time)
-        return "" if found is None else str(found)
+        value = None if attribute is None else read.raw(attribute, self._time)
+        return "" if value is None else str(value)
 
-    def picture(
+    def image(
         self, shader_input: UsdShade.Input, channels: list[int], uv: str, transform: Floats, *, color: bool
     ) -> ShadingValue | None:
-        """The image that an input names, repeated, or what is connected to it; None where no image can be read.
+        """The image that an input names, with wrap mode repeat, or the value of a connected node.
 
         Args:
-            shader_input: An asset, or what takes a node.
-            channels: Numbers of those that are wanted, of r, g, b and a.
-            uv: The primvar that places it.
-            transform: What is done to it, [3, 3].
-            color: Whether it may be decoded.
+            shader_input: An asset input.
+            channels: Indices of the channels, of r, g, b and a.
+            uv: The primvar with the texture coordinates.
+            transform: Transform of the texture coordinates, [3, 3].
+            color: Whether the image may be colour-encoded.
+
+        Returns:
+            The value; None: there is none that can be read.
         """
         attribute = read.producer(shader_input)
         if attribute is None:
@@ -102,144 +104,156 @@ class Network:
         self._nodes = 0
         try:
             if UsdShade.Output.IsOutput(attribute):
-                return self._input(shader_input, constant(*[0.0] * len(channels)), _DEPTH)
-            if not self._path(attribute):
+                return self._input(shader_input, constant(*[0.0] * len(channels)), _MAX_DEPTH)
+            if not self._asset_path(attribute):
                 return None
-            return self._file(attribute, channels, "auto" if color else "raw", _placed_by(uv, transform))
+            return self._image_value(attribute, channels, "auto" if color else "raw", _placement(uv, transform))
         except Unreadable as trouble:
-            self.warn(f"{shader_input.GetBaseName()}: {trouble}; it is left out")
+            self.warn(f"{shader_input.GetBaseName()}: {trouble}; it is skipped")
             return None
 
-    def file(
+    def image_file(
         self, asset: Sdf.AssetPath, channels: list[int], space: str, uv: str, transform: Floats
     ) -> ShadingValue | None:
-        """An image, repeated, as `picture` has it; None where it cannot be read."""
+        """The image of a file, with wrap mode repeat, as in `image`; None: it cannot be read."""
         try:
             pixels, key = self._images.pixels(asset, space, channels)
-            place = _placed(uv, transform, (Wrap.REPEAT, Wrap.REPEAT), (1, 1))
+            mapping = _place(uv, transform, (Wrap.REPEAT, Wrap.REPEAT), (1, 1))
         except Unreadable as trouble:
-            self.warn(f"{trouble}; it is left out")
+            self.warn(f"{trouble}; it is skipped")
             return None
-        return ShadingValue(pixels, np.zeros(len(channels)), place, (key, tuple(channels)), asset.path)
+        return ShadingValue(pixels, np.zeros(len(channels)), mapping, (key, tuple(channels)), asset.path)
 
-    def _file(
+    def _image_value(
         self,
         attribute: Usd.Attribute | None,
         channels: list[int],
         space: str,
-        place: Callable[[tuple[int, int]], UVMapping],
+        mapping: Callable[[tuple[int, int]], UVMapping],
         outside: Floats | None = None,
     ) -> ShadingValue:
-        """Channels of the image that an attribute names; `place` says where, given the UDIM tiles across and up.
+        """Channels of the image that an attribute names.
+
+        Args:
+            attribute: The asset; None: Unreadable is raised.
+            channels: Indices of the channels, of r, g, b and a.
+            space: Colour space, "auto" or "raw".
+            mapping: Returns the placement for a number of UDIM tiles (across, up).
+            outside: Value outside an image that does not repeat, [c]; None: 0.
 
         Raises:
-            Unreadable: There is none.
+            Unreadable: There is no readable image.
         """
         outside = np.zeros(len(channels)) if outside is None else outside
-        _, pixels, key, atlas = self._images.look_up(
+        _, pixels, key, tiles = self._images.look_up(
             attribute, self._time, space, np.resize(outside, 4), channels, self.warn
         )
-        return ShadingValue(pixels, outside, place(atlas), (key, tuple(channels)), self._path(attribute))
+        return ShadingValue(pixels, outside, mapping(tiles), (key, tuple(channels)), self._asset_path(attribute))
 
     def _input(self, shader_input: UsdShade.Input, default: ShadingValue, depth: int) -> ShadingValue:
+        """The value of an input: authored, or of the node that is connected to it."""
         attribute = read.producer(shader_input)
         if attribute is None:
             return default
         if not UsdShade.Output.IsOutput(attribute):
-            channels = read.raw(attribute, self._time)
-            if channels is None:
-                return default
-            array = np.asarray(channels)
-            if array.ndim > 1 or array.size == 0 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
-                what = "a finite colour" if array.shape == (3,) else "a finite number"
-                raise Unreadable(f"{attribute.GetName()} is {read.short(channels)}, not {what}")
-            array = np.atleast_1d(array).astype(np.float64)
-            if len(array) == 3 and read.is_color(attribute):
-                array = read.to_linear_rec709(attribute, array.reshape(1, 3))[0]
-            return constant(*array.tolist())
+            return self._authored(attribute, default)
         self._nodes += 1
-        if depth == 0 or self._nodes > _NODE_BUDGET:
-            raise Unreadable("the network of nodes is too deep")
+        if depth == 0 or self._nodes > _MAX_NODES:
+            raise Unreadable("the shading network is too large or too deep")
         node, output = UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName()
         identifier = str(node.GetShaderId() or "an unnamed node")
         name = identifier.removeprefix("ND_")
         if name in ("UsdUVTexture", "UsdUVTexture_23"):
-            return self._uv_texture(node, output, default)
+            return self._usd_uv_texture(node, output, default)
         reader, _, kind = name.partition("_")
-        if reader in _READERS and kind in _CHANNELS:
-            named, otherwise = _READERS[reader]
-            primvar = PrimvarRef(self._text(node.GetInput(named)), _CHANNELS[kind])
-            fallback = self._input(node.GetInput(otherwise), constant(*[0.0] * primvar.channels), depth - 1)
+        if reader in _PRIMVAR_READERS and kind in _CHANNELS:
+            name_input, fallback_input = _PRIMVAR_READERS[reader]
+            primvar = PrimvarRef(self._text(node.GetInput(name_input)), _CHANNELS[kind])
+            fallback = self._input(node.GetInput(fallback_input), constant(*[0.0] * primvar.channels), depth - 1)
             return from_primvar(primvar, fallback)
         if identifier.startswith("ND_"):
             if name.startswith(("image_", "tiledimage_", "gltf_image_", "gltf_colorimage", "gltf_normalmap")):
-                return self._image(node, name, output)
-            made = self._operation(node, name, output, depth - 1)
-            if made is not None:
-                return made
+                return self._materialx_image(node, name, output)
+            value = self._operation(node, name, output, depth - 1)
+            if value is not None:
+                return value
         kind = shader_name(node)
-        if kind in _FOREIGN_IMAGES:
+        if kind in _VENDOR_IMAGES:
             channels = {"a": [3], "resultA": [3]}.get(output, [0, 1, 2])
-            attribute = read.producer(node.GetInput(_FOREIGN_IMAGES[kind]))
+            attribute = read.producer(node.GetInput(_VENDOR_IMAGES[kind]))
             uv = self._text(node.GetInput("uvset"), "st")
-            return self._file(attribute, channels, "auto", _placed_by(uv, np.eye(3)))
-        raise Unreadable(f"the node {kind or identifier} is not understood")
+            return self._image_value(attribute, channels, "auto", _placement(uv, np.eye(3)))
+        raise Unreadable(f"the node {kind or identifier} is not supported")
+
+    def _authored(self, attribute: Usd.Attribute, default: ShadingValue) -> ShadingValue:
+        """The number or colour that an attribute holds; the default if it has no value."""
+        authored = read.raw(attribute, self._time)
+        if authored is None:
+            return default
+        array = np.asarray(authored)
+        if array.ndim > 1 or array.size == 0 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+            what = "a finite colour" if array.shape == (3,) else "a finite number"
+            raise Unreadable(f"{attribute.GetName()} is {read.short(authored)}, not {what}")
+        array = np.atleast_1d(array).astype(np.float64)
+        if len(array) == 3 and read.is_color(attribute):
+            array = read.to_linear_rec709(attribute, array.reshape(1, 3))[0]
+        return constant(*array.tolist())
 
     def _operation(self, node: UsdShade.Shader, name: str, output: str, depth: int) -> ShadingValue | None:
-        """MaterialX's arithmetic; None if the node is none."""
+        """MaterialX's arithmetic nodes; None: it is another node."""
 
-        def get(key: str, *default: float) -> ShadingValue:
+        def argument(key: str, *default: float) -> ShadingValue:
             return self._input(node.GetInput(key), constant(*default), depth)
 
         kind = name.split("_")[0]
         if kind == "constant":
-            return get("value", 0.0)
+            return argument("value", 0.0)
         if kind in ("convert", "dot"):
-            found, wanted = get("in", 0.0), name.rsplit("_", 1)[-1]
-            return as_color(found) if wanted in ("color3", "vector3") else found
+            operand, target = argument("in", 0.0), name.rsplit("_", 1)[-1]
+            return as_color(operand) if target in ("color3", "vector3") else operand
         if kind == "extract":
-            found = get("in", 0.0)
-            index = int(get("index", 0.0).mean[0])
-            return select(found, [min(max(index, 0), found.pixels.shape[2] - 1)])
+            operand = argument("in", 0.0)
+            index = int(argument("index", 0.0).mean[0])
+            return select(operand, [min(max(index, 0), operand.pixels.shape[2] - 1)])
         if kind.startswith("separate"):
-            found = get("in", 0.0)
+            operand = argument("in", 0.0)
             index = {"r": 0, "x": 0, "g": 1, "y": 1, "b": 2, "z": 2}.get(output.removeprefix("out")[-1:], 3)
-            return select(found, [min(index, found.pixels.shape[2] - 1)])
+            return select(operand, [min(index, operand.pixels.shape[2] - 1)])
         if kind in ("combine2", "combine3", "combine4"):
-            parts = [get(f"in{k + 1}", 0.0) for k in range(int(kind[-1]))]
+            parts = [argument(f"in{k + 1}", 0.0) for k in range(int(kind[-1]))]
             return combine(kind, lambda *a: np.concatenate(np.broadcast_arrays(*(x[..., :1] for x in a)), -1), *parts)
         if kind in ("multiply", "divide"):
             call = np.multiply if kind == "multiply" else lambda a, b: a / np.where(b == 0.0, np.inf, b)
-            return combine(kind, call, get("in1", 0.0), get("in2", 1.0))
+            return combine(kind, call, argument("in1", 0.0), argument("in2", 1.0))
         if kind in ("add", "subtract", "min", "max", "minimum", "maximum", "power", "difference"):
-            functions: dict[str, Callable[..., Any]] = {
+            functions: dict[str, Callable[[Floats, Floats], Floats]] = {
                 "add": np.add,
                 "subtract": np.subtract,
                 "difference": lambda a, b: np.abs(a - b),
                 "power": lambda a, b: np.maximum(a, 0.0) ** b,
             }
             call = functions.get(kind, np.minimum if kind.startswith("min") else np.maximum)
-            return combine(kind, call, get("in1", 0.0), get("in2", 1.0 if kind == "power" else 0.0))
+            return combine(kind, call, argument("in1", 0.0), argument("in2", 1.0 if kind == "power" else 0.0))
         if kind == "mix":
-            inputs = get("bg", 0.0), get("fg", 0.0), get("mix", 0.0)
+            inputs = argument("bg", 0.0), argument("fg", 0.0), argument("mix", 0.0)
             return combine(kind, lambda bg, fg, mix: bg * (1.0 - mix) + fg * mix, *inputs)
         if kind == "invert":
-            return combine(kind, np.subtract, get("amount", 1.0), get("in", 0.0))
+            return combine(kind, np.subtract, argument("amount", 1.0), argument("in", 0.0))
         if kind == "clamp":
-            return combine(kind, np.clip, get("in", 0.0), get("low", 0.0), get("high", 1.0))
+            return combine(kind, np.clip, argument("in", 0.0), argument("low", 0.0), argument("high", 1.0))
         if kind == "normalmap":
             if self._text(node.GetInput("space"), "tangent") != "tangent":
                 raise Unreadable("only normal maps in tangent space are read")
-            weight = get("scale", 1.0)
-            return combine(kind, _unpacked_normal, as_color(get("in", 0.5, 0.5, 1.0)), weight)
+            weight = argument("scale", 1.0)
+            return combine(kind, _unpacked_normal, as_color(argument("in", 0.5, 0.5, 1.0)), weight)
         if kind == "luminance":
             weights = np.array([0.2126729, 0.7151522, 0.0721750])
             return combine(
-                kind, lambda a: np.repeat((a[..., :3] @ weights)[..., None], 3, -1), as_color(get("in", 0.0))
+                kind, lambda a: np.repeat((a[..., :3] @ weights)[..., None], 3, -1), as_color(argument("in", 0.0))
             )
         return None
 
-    def _uv_texture(self, node: UsdShade.Shader, output: str, default: ShadingValue) -> ShadingValue:
+    def _usd_uv_texture(self, node: UsdShade.Shader, output: str, default: ShadingValue) -> ShadingValue:
         """UsdUVTexture: out = image * scale + bias."""
         fallback = self._constant(node, "fallback", [0.0, 0.0, 0.0, 1.0])
         scale, bias = self._constant(node, "scale", [1.0] * 4), self._constant(node, "bias", [0.0] * 4)
@@ -247,7 +261,7 @@ class Network:
         attribute = read.producer(node.GetInput("file"))
         space = self._text(node.GetInput("sourceColorSpace"), "auto")
         try:
-            image, pixels, key, atlas = self._images.look_up(
+            image, pixels, key, tiles = self._images.look_up(
                 attribute, self._time, space, fallback, channels, self.warn
             )
         except Unreadable as trouble:
@@ -259,18 +273,18 @@ class Network:
             if mode not in _WRAPS:
                 mode = image.wrap[axis] or self._images.default_wrap
             wraps.append(_WRAPS[mode])
-        uv, transform = self._coordinates(node.GetInput("st"), _DEPTH, unconnected=_at(0.0, 0.0))
-        place = _placed(uv, transform, (wraps[0], wraps[1]), atlas)
-        outside = fallback if atlas != (1, 1) else np.zeros(4)  # black is transparent black
+        uv, transform = self._texture_coordinates(node.GetInput("st"), _MAX_DEPTH, unconnected=_constant_uv(0.0, 0.0))
+        mapping = _place(uv, transform, (wraps[0], wraps[1]), tiles)
+        outside = fallback if tiles != (1, 1) else np.zeros(4)  # wrap mode black is transparent black
         key = (key, tuple(channels))
-        signal = ShadingValue(pixels, outside[channels], place, key, self._path(attribute))
+        value = ShadingValue(pixels, outside[channels], mapping, key, self._asset_path(attribute))
         if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
-            return signal
+            return value
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))
-        return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), signal)
+        return combine(label, lambda a: a * scale[channels].astype(a.dtype) + bias[channels].astype(a.dtype), value)
 
-    def _image(self, node: UsdShade.Shader, name: str, output: str) -> ShadingValue:
-        """MaterialX's image and tiledimage, and glTF's images in MaterialX."""
+    def _materialx_image(self, node: UsdShade.Shader, name: str, output: str) -> ShadingValue:
+        """MaterialX's nodes image and tiledimage, and its glTF images."""
         gltf = name.startswith("gltf_")
         wanted = name.removesuffix("_1_0").rsplit("_", 1)[-1]
         count = {"float": 1, "vector2": 2, "color4": 4, "vector4": 4, "colorimage": 4}.get(wanted, 3)
@@ -280,7 +294,7 @@ class Network:
             _MATERIALX_WRAPS.get(self._text(node.GetInput(f"{axis}addressmode"), "periodic"), Wrap.REPEAT)
             for axis in "uv"
         ]
-        uv, transform = self._coordinates(node.GetInput("texcoord"), _DEPTH, unconnected=np.eye(3))
+        uv, transform = self._texture_coordinates(node.GetInput("texcoord"), _MAX_DEPTH, unconnected=np.eye(3))
         if name.startswith("tiledimage_"):
             tiling = self._constant(node, "uvtiling", [1.0, 1.0])
             offset = self._constant(node, "uvoffset", [0.0, 0.0])
@@ -289,38 +303,45 @@ class Network:
         if gltf:
             pivot, scale = self._constant(node, "pivot", [0.0, 1.0]), self._constant(node, "scale", [1.0, 1.0])
             x, y = self._constant(node, "offset", [0.0, 0.0])
-            turn = _rotation(self._constant(node, "rotate", [0.0])[0])
-            transform = _moved(*pivot) @ _moved(x, -y) @ turn @ np.diag([*scale, 1.0]) @ _moved(*-pivot) @ transform
+            rotation = _rotation(self._constant(node, "rotate", [0.0])[0])
+            transform = (
+                _translation(*pivot)
+                @ _translation(x, -y)
+                @ rotation
+                @ np.diag([*scale, 1.0])
+                @ _translation(*-pivot)
+                @ transform
+            )
         space = "auto" if wanted.startswith("color") else "raw"
         try:
-            signal = self._file(
-                attribute, list(range(count)), space, _placed_by(uv, transform, (modes[0], modes[1])), default
+            value = self._image_value(
+                attribute, list(range(count)), space, _placement(uv, transform, (modes[0], modes[1])), default
             )
         except Unreadable as trouble:
             self.warn(f"{trouble}; the image's default is used")
-            signal = constant(*default.tolist())
+            value = constant(*default.tolist())
         if name.startswith("gltf_normalmap"):
-            return combine("normalmap", _unpacked_normal, signal, constant(1.0))
+            return combine("normalmap", _unpacked_normal, value, constant(1.0))
         for factor in ("factor", "color", "geomcolor") if gltf else ():
             if read.producer(node.GetInput(factor)) is not None:
-                signal = combine("factor", np.multiply, signal, self._input(node.GetInput(factor), signal, _DEPTH))
+                value = combine("factor", np.multiply, value, self._input(node.GetInput(factor), value, _MAX_DEPTH))
         if wanted == "colorimage":
-            return select(signal, [3] if output == "outa" else [0, 1, 2])
-        return signal
+            return select(value, [3] if output == "outa" else [0, 1, 2])
+        return value
 
-    def _path(self, attribute: Usd.Attribute | None) -> str:
-        """The path that an asset attribute holds."""
+    def _asset_path(self, attribute: Usd.Attribute | None) -> str:
+        """The authored path of an asset attribute; "" if it has none."""
         asset = read.raw(attribute, self._time) if attribute is not None else None
         return asset.path if isinstance(asset, Sdf.AssetPath) else str(asset or "")
 
-    def _coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
-        """The uv set that an input reads, and what is done to it, [3, 3]."""
+    def _texture_coordinates(self, shader_input: UsdShade.Input, depth: int, unconnected: Floats) -> tuple[str, Floats]:
+        """The set of texture coordinates that an input reads, and their transform [3, 3]."""
         attribute = read.producer(shader_input)
         if attribute is None or not UsdShade.Output.IsOutput(attribute):
             authored = np.asarray(read.raw(attribute, self._time) if attribute is not None else None)
             if authored.shape != (2,) or authored.dtype.kind not in "fiu" or not np.isfinite(authored).all():
                 return "st", unconnected
-            return "st", _at(float(authored[0]), float(authored[1]))
+            return "st", _constant_uv(float(authored[0]), float(authored[1]))
         node = UsdShade.Shader(attribute.GetPrim())
         name = str(node.GetShaderId() or "").removeprefix("ND_")
         if depth == 0:
@@ -332,51 +353,56 @@ class Network:
         if name == "geompropvalue_vector2":
             return self._text(node.GetInput("geomprop"), "st"), np.eye(3)
         if name == "UsdTransform2d":
-            uv, before = self._coordinates(node.GetInput("in"), depth - 1, unconnected)
-            move, scale = self._constant(node, "translation", [0.0, 0.0]), self._constant(node, "scale", [1.0, 1.0])
-            turn = _rotation(self._constant(node, "rotation", [0.0])[0])
-            turn[:2, 2] = move
-            return uv, turn @ np.diag([scale[0], scale[1], 1.0]) @ before
+            uv, inner = self._texture_coordinates(node.GetInput("in"), depth - 1, unconnected)
+            translation, scale = (
+                self._constant(node, "translation", [0.0, 0.0]),
+                self._constant(node, "scale", [1.0, 1.0]),
+            )
+            rotation = _rotation(self._constant(node, "rotation", [0.0])[0])
+            rotation[:2, 2] = translation
+            return uv, rotation @ np.diag([scale[0], scale[1], 1.0]) @ inner
         if name.startswith("place2d_vector2"):
-            uv, before = self._coordinates(node.GetInput("texcoord"), depth - 1, np.eye(3))
+            uv, inner = self._texture_coordinates(node.GetInput("texcoord"), depth - 1, np.eye(3))
             pivot, offset = self._constant(node, "pivot", [0.0, 0.0]), self._constant(node, "offset", [0.0, 0.0])
             scale = self._constant(node, "scale", [1.0, 1.0])
             shrink = np.diag([1.0 / scale[0] if scale[0] else 0.0, 1.0 / scale[1] if scale[1] else 0.0, 1.0])
-            turn = _rotation(-self._constant(node, "rotate", [0.0])[0])
-            return uv, _moved(*pivot) @ _moved(*-offset) @ turn @ shrink @ _moved(*-pivot) @ before
+            rotation = _rotation(-self._constant(node, "rotate", [0.0])[0])
+            return uv, _translation(*pivot) @ _translation(*-offset) @ rotation @ shrink @ _translation(*-pivot) @ inner
         if name.startswith(("multiply_vector2", "add_vector2")):
-            uv, before = self._coordinates(node.GetInput("in1"), depth - 1, np.eye(3))
+            uv, inner = self._texture_coordinates(node.GetInput("in1"), depth - 1, np.eye(3))
             amount = np.resize(self._constant(node, "in2", [float(name.startswith("multiply"))]), 2)
-            return uv, (np.diag([*amount, 1.0]) if name.startswith("multiply") else _moved(*amount)) @ before
-        raise Unreadable(f"texture coordinates from the node {name} are not understood")
+            return uv, (np.diag([*amount, 1.0]) if name.startswith("multiply") else _translation(*amount)) @ inner
+        raise Unreadable(f"texture coordinates from the node {name} are not supported")
 
     def _constant(self, node: UsdShade.Shader, name: str, default: list[float]) -> Floats:
-        """An input's numbers, float64 [c]; a network's are averaged."""
-        signal = self._input(node.GetInput(name), constant(*default), 2)
-        if signal.primvars:
-            self.warn(f"{name} reads the primvar '{signal.primvars[0].name}': it takes the reader's fallback")
-        found = signal.mean
-        return found if len(found) == len(default) else np.resize(found, len(default))
+        """An input as numbers, float64 [c]; the mean if an image is connected."""
+        value = self._input(node.GetInput(name), constant(*default), 2)
+        if value.primvars:
+            self.warn(f"{name} reads the primvar '{value.primvars[0].name}': the reader's fallback is used")
+        numbers = value.mean
+        return numbers if len(numbers) == len(default) else np.resize(numbers, len(default))
 
     def _text(self, shader_input: UsdShade.Input, default: str = "") -> str:
+        """An input as a string or token; the default if it has no value."""
         attribute = read.producer(shader_input)
         return read.text(attribute, self._time, default) or default if attribute is not None else default
 
 
 def _unpacked_normal(packed: Floats, scale: Floats) -> Floats:
-    """Normals from numbers between 0 and 1, by MaterialX's node normalmap, whose scale is for x and y."""
+    """Normals from values in [0, 1], as MaterialX's node normalmap decodes them; the scale applies to x and y."""
     across = np.broadcast_to(scale, (*scale.shape[:-1], 2))
     return np.asarray((2.0 * packed - 1.0) * np.concatenate([across, np.ones_like(scale[..., :1])], axis=-1))
 
 
-def _placed_by(
+def _placement(
     uv: str, transform: Floats, wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
 ) -> Callable[[tuple[int, int]], UVMapping]:
-    """Where an image lies, given its UDIM tiles."""
-    return lambda tiles: _placed(uv, transform, wrap, tiles)
+    """The placement of an image as a function of its number of UDIM tiles (across, up)."""
+    return lambda tiles: _place(uv, transform, wrap, tiles)
 
 
-def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> UVMapping:
+def _place(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[int, int]) -> UVMapping:
+    """The placement of an image; UDIM tiles are joined to one image that does not repeat."""
     if tiles != (1, 1):
         transform = np.diag([1.0 / tiles[0], 1.0 / tiles[1], 1.0]) @ transform
         wrap = (Wrap.BLACK, Wrap.BLACK)
@@ -386,12 +412,12 @@ def _placed(uv: str, transform: Floats, wrap: tuple[Wrap, Wrap], tiles: tuple[in
     return UVMapping(uv, ((s[0], s[1], s[2]), (t[0], t[1], t[2])), wrap)
 
 
-def _at(s: float, t: float) -> Floats:
-    """Everything to one point."""
+def _constant_uv(s: float, t: float) -> Floats:
+    """Transform of all texture coordinates to one point."""
     return np.array([[0.0, 0.0, s], [0.0, 0.0, t], [0.0, 0.0, 1.0]])
 
 
-def _moved(x: float, y: float) -> Floats:
+def _translation(x: float, y: float) -> Floats:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 

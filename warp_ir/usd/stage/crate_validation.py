@@ -1,6 +1,6 @@
-"""Sizes that a .usdc file states, checked against what it holds: USD allocates them first and reads then.
+"""Validates the table sizes in crate files (.usdc) before USD allocates them.
 
-A damaged byte in a count would otherwise cost gigabytes, and the seconds to touch them, before the file is refused.
+Otherwise a damaged byte in a count costs gigabytes, and the seconds to touch them, before USD refuses the file.
 """
 
 import mmap
@@ -11,48 +11,48 @@ from warp_ir.scene import InputError
 
 _MAGIC = b"PXR-USDC"
 _LOCAL = struct.Struct("<4s5H3L2H")
-"""What precedes each file in a ZIP archive."""
+"""Header of each file in a ZIP archive."""
 _TABLES = {"TOKENS": 0, "STRINGS": 0, "FIELDS": 2, "FIELDSETS": 1, "PATHS": 3, "SPECS": 3}
-"""The tables with a count, and how many compressed blocks follow it."""
-_PER_BYTE = 2048
-"""Most numbers that a compressed byte can stand for: LZ4 packs 255 bytes into one, the integer coding 4 in each."""
+"""Tables that begin with a count, with the number of compressed blocks that follow it."""
+_MAX_VALUES_PER_BYTE = 2048
+"""Maximum number of values per compressed byte: LZ4 packs 255 bytes into one, integer coding 4 values into each."""
 
 
-def check_sizes(path: str) -> None:
-    """Look at the tables of a .usdc file, or of those inside a .usdz; anything else is left to USD.
+def validate_crate(path: str) -> None:
+    """Check the table sizes of a crate file, or of those in a .usdz package; other files are left to USD.
 
     Raises:
-        InputError: A table is said to be larger than it can be.
+        InputError: A table is larger than its data can be.
     """
-    for name, data in _crates(path):
+    for name, data in _crate_files(path):
         try:
-            bad = _oversized(data)
-        except struct.error:  # cut off: USD finds that at once
+            bad = _oversized_table(data)
+        except struct.error:  # truncated: USD detects that at once
             bad = ""
         if bad:
             raise InputError(f"{path}: cannot be opened as USD: {name}the table {bad} is damaged")
 
 
-def _crates(path: str) -> Iterator[tuple[str, memoryview]]:
-    """The binary layers in a file, each with a prefix for messages; in a package as USD finds them, one by one."""
+def _crate_files(path: str) -> Iterator[tuple[str, memoryview]]:
+    """The crate files in a file, each with a prefix for messages; those of a package in order."""
     with open(path, "rb") as file:
         if not file.read(1):
-            return  # nothing to map
+            return  # an empty file cannot be mapped
         data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     if bytes(data[:8]) == _MAGIC:
         yield "", data
-    at = 0
-    while bytes(data[at : at + 4]) == b"PK\3\4" and at + _LOCAL.size <= len(data):
-        *_, size, _, name_length, extra_length = _LOCAL.unpack_from(data, at)
-        name = bytes(data[at + _LOCAL.size :][:name_length]).decode("ascii", "replace")
-        at += _LOCAL.size + name_length + extra_length
-        if bytes(data[at : at + 8]) == _MAGIC:
-            yield f"{name}: ", data[at : at + size]
-        at += size
+    offset = 0
+    while bytes(data[offset : offset + 4]) == b"PK\3\4" and offset + _LOCAL.size <= len(data):
+        *_, size, _, name_length, extra_length = _LOCAL.unpack_from(data, offset)
+        name = bytes(data[offset + _LOCAL.size :][:name_length]).decode("ascii", "replace")
+        offset += _LOCAL.size + name_length + extra_length
+        if bytes(data[offset : offset + 8]) == _MAGIC:
+            yield f"{name}: ", data[offset : offset + size]
+        offset += size
 
 
-def _oversized(data: memoryview) -> str:
-    """The name of the first table with an impossible size; empty if there is none."""
+def _oversized_table(data: memoryview) -> str:
+    """Name of the first table with an impossible size; "" if there is none."""
     (directory,) = struct.unpack_from("<q", data, 16)
     if not 0 < directory < len(data):
         return ""
@@ -70,23 +70,23 @@ def _oversized(data: memoryview) -> str:
 
 
 def _fits(name: str, table: memoryview) -> bool:
-    """Whether a table can hold what its own header says."""
-    most = _PER_BYTE * len(table)
+    """Whether the sizes in a table's header fit its data."""
+    limit = _MAX_VALUES_PER_BYTE * len(table)
     (count,) = struct.unpack_from("<Q", table, 0)
-    if count > most:
+    if count > limit:
         return False
-    at = 8
+    offset = 8
     if name == "TOKENS":
-        plain, packed = struct.unpack_from("<QQ", table, at)
-        return bool(plain <= most and packed <= len(table))
+        plain, packed = struct.unpack_from("<QQ", table, offset)
+        return bool(plain <= limit and packed <= len(table))
     if name == "PATHS":
-        (encoded,) = struct.unpack_from("<Q", table, at)
-        if encoded > most:
+        (encoded,) = struct.unpack_from("<Q", table, offset)
+        if encoded > limit:
             return False
-        at += 8
+        offset += 8
     for _ in range(_TABLES[name]):
-        (packed,) = struct.unpack_from("<Q", table, at)
-        at += 8 + packed
-        if at > len(table):
+        (packed,) = struct.unpack_from("<Q", table, offset)
+        offset += 8 + packed
+        if offset > len(table):
             return False
     return True

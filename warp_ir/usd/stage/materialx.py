@@ -1,13 +1,13 @@
-"""MaterialX documents (.mtlx) as layers of UsdShade prims, laid out as OpenUSD's own plug-in does.
+"""MaterialX documents (.mtlx) as layers of UsdShade prims, laid out as by OpenUSD's plug-in.
 
-`/MaterialX/Materials/NAME` is a material: its surface shader, the nodes and node graphs that feed it, and an interface
-of the values that the shader is given. USD's wheels have no reader for such files; the package MaterialX parses them,
-brings old versions up to date and knows which definition a node has.
+`/MaterialX/Materials/NAME` is a material. It contains the surface shader, the nodes and node graphs connected to it,
+and interface inputs for the shader's values. USD's wheels have no reader for such files. The package MaterialX parses
+them, upgrades old versions and knows the definition of each node.
 """
 
 import os
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 from xml.parsers import expat
 
 import numpy as np
@@ -15,13 +15,16 @@ from pxr import Ar, Gf, Sdf, Tf, Usd, UsdShade
 
 from warp_ir.usd.values.report import Unreadable
 
+if TYPE_CHECKING:
+    import MaterialX
+
 _MAX_BYTES = 2**24
-"""Of one document; those that people write have a few thousand."""
+"""Maximum size of a document; hand-written ones have a few thousand bytes."""
 _MAX_ELEMENTS = 100_000
 _MAX_DEPTH = 64
-"""Of elements in elements: the parser of the library is recursive."""
+"""Maximum nesting depth of elements: the library's parser is recursive."""
 _MAX_PRIMS = 20_000
-"""Nodes written for all materials together: each has its own copy of what it uses."""
+"""Maximum number of nodes over all materials: each material has copies of the nodes that it uses."""
 _TYPES = {
     "float": Sdf.ValueTypeNames.Float,
     "integer": Sdf.ValueTypeNames.Int,
@@ -34,7 +37,8 @@ _TYPES = {
     "string": Sdf.ValueTypeNames.String,
     "filename": Sdf.ValueTypeNames.Asset,
 }
-"""What USD calls MaterialX's types; matrices and arrays feed nothing that is rendered."""
+"""MaterialX's types in USD; matrices and arrays have no effect on the rendering."""
+
 _VECTORS = {2: Gf.Vec2f, 3: Gf.Vec3f, 4: Gf.Vec4f}
 
 
@@ -48,44 +52,42 @@ def available() -> bool:
 
 
 def materialx_layer(source: str) -> tuple[Sdf.Layer, list[str]]:
-    """A document as a layer in memory, and what of it is left out.
+    """A document as a layer in memory, with messages on what it lacks.
 
     Args:
-        source: Its resolved path, which may lie in a package (`a.usdz[b.mtlx]`).
+        source: Resolved path, which may lie in a package (`a.usdz[b.mtlx]`).
 
     Raises:
-        Unreadable: It is missing, no MaterialX document, or unreasonably large or deep.
+        Unreadable: The file is missing, not a MaterialX document, or too large or deep.
     """
     content = _content(source)
-    includes = _check(content)
+    includes = _check_xml(content)
     document = _document(content)
     layer = Sdf.Layer.CreateAnonymous(f"{os.path.basename(source)}.usda")
     writer = _Writer(Usd.Stage.Open(layer), document, Ar.ResolvedPath(source))
     writer.write()
-    left_out = [*writer.left_out, *(["the documents that it includes are not read"] if includes else [])]
+    left_out = [*writer.left_out, *(["included documents are not read"] if includes else [])]
     if document.getLooks():
-        left_out.append("its looks are not read: they bind no materials")
+        left_out.append("its looks are not read: they assign no materials")
     return layer, left_out
 
 
 def _content(source: str) -> bytes:
-    opened = None if os.path.exists(source) and not os.path.isfile(source) else _asset(source)
-    if opened is None:
-        raise Unreadable("not found")
-    if opened.GetSize() > _MAX_BYTES:
-        raise Unreadable(f"{opened.GetSize()} bytes; the limit is {_MAX_BYTES}")
-    return bytes(opened.GetBuffer() or b"")
-
-
-def _asset(source: str) -> Any:
+    """The content of a file, limited in size."""
+    readable = not os.path.exists(source) or os.path.isfile(source)  # a path in a package does not exist by itself
     try:
-        return Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source))
+        asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(source)) if readable else None
     except Tf.ErrorException:
-        return None
+        asset = None
+    if asset is None:
+        raise Unreadable("not found")
+    if asset.GetSize() > _MAX_BYTES:
+        raise Unreadable(f"{asset.GetSize()} bytes; the limit is {_MAX_BYTES}")
+    return bytes(asset.GetBuffer() or b"")
 
 
-def _check(content: bytes) -> bool:
-    """See that it is XML without entities, not too large and not too deep; whether it includes other documents.
+def _check_xml(content: bytes) -> bool:
+    """Checks that a document is XML without entities, of limited size and depth; returns whether it includes others.
 
     Raises:
         Unreadable: It is not.
@@ -96,14 +98,14 @@ def _check(content: bytes) -> bool:
         nonlocal open_elements, elements, includes
         open_elements, elements, includes = open_elements + 1, elements + 1, includes or name == "xi:include"
         if open_elements > _MAX_DEPTH or elements > _MAX_ELEMENTS:
-            raise Unreadable("its elements are too many or nested too deeply")
+            raise Unreadable("it has too many elements, or they are nested too deeply")
 
     def end(_name: str) -> None:
         nonlocal open_elements
         open_elements -= 1
 
     def declared(*_: object) -> None:
-        raise Unreadable("it declares a document type, which MaterialX has no use for")
+        raise Unreadable("it declares a document type, which is not allowed")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = start, end
@@ -115,8 +117,8 @@ def _check(content: bytes) -> bool:
     return includes
 
 
-def _document(content: bytes) -> Any:
-    """The document of the library, with the standard definitions.
+def _document(content: bytes) -> "MaterialX.Document":
+    """The document parsed by the library, with the standard definitions.
 
     Raises:
         Unreadable: The library refuses it.
@@ -124,17 +126,18 @@ def _document(content: bytes) -> Any:
     import MaterialX as mx
 
     document, options = mx.createDocument(), mx.XmlReadOptions()
-    options.readXIncludeFunction = None  # a file may not make others be read
+    options.readXIncludeFunction = None  # included files are not trusted
     try:
         mx.readFromXmlString(document, content.decode("utf-8", "replace"), mx.FileSearchPath(), options)
         document.setDataLibrary(_standard_library())
-    except Exception as error:  # the library has no common base of its errors
+    except Exception as error:  # the library's errors have no common base class
         raise Unreadable(f"no MaterialX: {_first_line(error)}") from None
     return document
 
 
 @lru_cache(maxsize=1)
-def _standard_library() -> Any:
+def _standard_library() -> "MaterialX.Document":
+    """The library's standard definitions."""
     import MaterialX as mx
 
     library = mx.createDocument()
@@ -146,18 +149,19 @@ class _Writer:
     """Writes the materials of a document as prims.
 
     Args:
-        stage: Where to.
+        stage: The stage to write to.
         document: The document.
-        anchor: What the paths in it are relative to.
+        anchor: The path that relative paths in it refer to.
     """
 
-    def __init__(self, stage: Usd.Stage, document: Any, anchor: Ar.ResolvedPath) -> None:
+    def __init__(self, stage: Usd.Stage, document: "MaterialX.Document", anchor: Ar.ResolvedPath) -> None:
         self._stage, self._document, self._anchor = stage, document, anchor
-        self._waiting: list[tuple[Any, Sdf.Path]] = []
+        self._pending: list[tuple[MaterialX.Node, Sdf.Path]] = []
         self._written: set[Sdf.Path] = set()
         self.left_out: list[str] = []
 
     def write(self) -> None:
+        """Writes all materials."""
         root = self._stage.DefinePrim("/MaterialX")
         self._stage.SetDefaultPrim(root)
         folder = self._stage.DefinePrim("/MaterialX/Materials").GetPath()
@@ -166,46 +170,46 @@ class _Writer:
                 self._material(node, folder)
             except Unreadable:
                 raise
-            except Exception as error:  # the library has no common base of its errors
+            except Exception as error:  # the library's errors have no common base class
                 self.left_out.append(f"{node.getName()}: {_first_line(error)}")
 
-    def _material(self, node: Any, folder: Sdf.Path) -> None:
+    def _material(self, node: "MaterialX.Node", folder: Sdf.Path) -> None:
         material = UsdShade.Material.Define(self._stage, _child(folder, node.getName()))
-        for slot in node.getInputs():
-            shader = slot.getConnectedNode()
-            if shader is None or slot.getName() != "surfaceshader":
+        for material_input in node.getInputs():
+            shader = material_input.getConnectedNode()
+            if shader is None or material_input.getName() != "surfaceshader":
                 continue
             path = self._node(shader, material.GetPath())
-            self._fill(material)
+            self._write_pending(material)
             written = UsdShade.Shader.Get(self._stage, path)
-            # The values of the surface are the material's interface: whoever references it may change them there.
-            for given in written.GetInputs():
-                value = given.Get()
+            # The shader's values become interface inputs, so that references to the material can override them.
+            for shader_input in written.GetInputs():
+                value = shader_input.Get()
                 if value is not None:
-                    ours = material.CreateInput(given.GetBaseName(), given.GetTypeName())
-                    ours.Set(value)
-                    if given.GetAttr().HasColorSpace():
-                        ours.GetAttr().SetColorSpace(given.GetAttr().GetColorSpace())
-                    given.GetAttr().Clear()
-                    given.ConnectToSource(ours)
+                    interface_input = material.CreateInput(shader_input.GetBaseName(), shader_input.GetTypeName())
+                    interface_input.Set(value)
+                    if shader_input.GetAttr().HasColorSpace():
+                        interface_input.GetAttr().SetColorSpace(shader_input.GetAttr().GetColorSpace())
+                    shader_input.GetAttr().Clear()
+                    shader_input.ConnectToSource(interface_input)
             material.CreateSurfaceOutput("mtlx").ConnectToSource(
                 written.CreateOutput("surface", Sdf.ValueTypeNames.Token)
             )
 
-    def _node(self, node: Any, scope: Sdf.Path) -> Sdf.Path:
-        """The path at which a node will be written."""
+    def _node(self, node: "MaterialX.Node", scope: Sdf.Path) -> Sdf.Path:
+        """The prim path of a node, which is queued for writing."""
         path = _child(scope, node.getName())
         if path not in self._written:
             if len(self._written) >= _MAX_PRIMS:
                 raise Unreadable(f"more than {_MAX_PRIMS} nodes are used")
             self._written.add(path)
-            self._waiting.append((node, path))
+            self._pending.append((node, path))
         return path
 
-    def _fill(self, material: UsdShade.Material) -> None:
-        """Writes nodes, and those that they lead to, until none is left."""
-        while self._waiting:
-            node, path = self._waiting.pop()
+    def _write_pending(self, material: UsdShade.Material) -> None:
+        """Writes the queued nodes and the nodes connected to them."""
+        while self._pending:
+            node, path = self._pending.pop()
             if node.getCategory() == "nodegraph":
                 graph = UsdShade.NodeGraph.Define(self._stage, path)
                 for element in node.getInputs():
@@ -221,28 +225,30 @@ class _Writer:
             for element in node.getInputs():
                 self._input(element, shader.ConnectableAPI(), path.GetParentPath())
 
-    def _input(self, element: Any, owner: UsdShade.ConnectableAPI, scope: Sdf.Path) -> None:
-        """One input: connected, or with its value; `scope` holds the nodes it may name."""
+    def _input(self, element: "MaterialX.PortElement", owner: UsdShade.ConnectableAPI, scope: Sdf.Path) -> None:
+        """Writes an input with its connection or value; `scope` contains the nodes that it may name."""
         if element.getType() not in _TYPES:
             return
-        made = owner.CreateInput(Tf.MakeValidIdentifier(element.getName()), _type(element))
+        port = owner.CreateInput(Tf.MakeValidIdentifier(element.getName()), _type(element))
         if element.getInterfaceName():
             graph = UsdShade.ConnectableAPI(self._stage.GetPrimAtPath(scope))
-            made.ConnectToSource(graph.CreateInput(Tf.MakeValidIdentifier(element.getInterfaceName()), _type(element)))
+            port.ConnectToSource(graph.CreateInput(Tf.MakeValidIdentifier(element.getInterfaceName()), _type(element)))
             return
-        if self._connect(element, made, scope):
+        if self._connect(element, port, scope):
             return
         value = self._value(element)
         if value is None:
             return
-        made.Set(value)
+        port.Set(value)
         space = element.getActiveColorSpace() if element.getType() in ("color3", "color4", "filename") else ""
-        # What the document says of all its colours is said of images only where it stands on them.
+        # The document's default colour space applies to colours; to images only their own one does.
         if space and (element.getType() != "filename" or element.hasAttribute("colorspace")):
-            made.GetAttr().SetColorSpace(space)
+            port.GetAttr().SetColorSpace(space)
 
-    def _connect(self, element: Any, made: UsdShade.Input | UsdShade.Output, scope: Sdf.Path) -> bool:
-        """Connects an input or an output of a graph to what the document says; whether it says anything."""
+    def _connect(
+        self, element: "MaterialX.PortElement", port: UsdShade.Input | UsdShade.Output, scope: Sdf.Path
+    ) -> bool:
+        """Connects an input, or an output of a graph, as the document says; returns whether it is connected."""
         graph_name, node_name = element.getAttribute("nodegraph"), element.getNodeName()
         parent = element.getParent() if element.getCategory() == "output" else element.getParent().getParent()
         if graph_name:
@@ -255,27 +261,28 @@ class _Writer:
             raise ValueError(f"{element.getNamePath()} is connected to '{graph_name or node_name}', which is not there")
         path = self._node(source, scope)
         prim = UsdShade.ConnectableAPI(self._stage.OverridePrim(path))
-        made.ConnectToSource(prim.CreateOutput(element.getOutputString() or "out", _type(element)))
+        port.ConnectToSource(prim.CreateOutput(element.getOutputString() or "out", _type(element)))
         return True
 
-    def _value(self, element: Any) -> Any:
+    def _value(self, element: "MaterialX.PortElement") -> object:
+        """The value of an element as USD stores it; None: it has none that is supported."""
         if element.getType() == "filename":
             return Sdf.AssetPath(self._path(element.getResolvedValueString(), element.getValueString()))
-        found = element.getValue()
-        if found is None or isinstance(found, bool | int | float | str):
-            return found
-        numbers = [float(x) for x in np.asarray(found.asTuple()).reshape(-1)]
+        value = element.getValue()
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        numbers = [float(x) for x in np.asarray(value.asTuple()).reshape(-1)]
         return _VECTORS[len(numbers)](*numbers) if len(numbers) in _VECTORS else None
 
     def _path(self, with_prefix: str, authored: str) -> str:
-        """Absolute path of a file; if a fileprefix leads nowhere, as it was written: other readers know no prefixes."""
+        """Absolute path of a file; as written if its fileprefix leads nowhere, since other readers ignore prefixes."""
         named = [text for text in (with_prefix, authored) if text]
         paths = [Ar.GetResolver().CreateIdentifier(_relative(text), self._anchor) for text in named]
         return next((path for path in paths if _exists(path)), paths[0] if paths else "")
 
 
 def _relative(path: str) -> str:
-    """A path that is sought beside the document, and nowhere else."""
+    """A path that is resolved relative to the document only."""
     return path if os.path.isabs(path) or path.startswith(("./", "../")) else f"./{path}"
 
 
@@ -289,7 +296,7 @@ def _child(scope: Sdf.Path, name: str) -> Sdf.Path:
     return scope.AppendChild(Tf.MakeValidIdentifier(name))
 
 
-def _type(element: Any) -> Sdf.ValueTypeName:
+def _type(element: "MaterialX.PortElement") -> Sdf.ValueTypeName:
     return _TYPES.get(element.getType(), Sdf.ValueTypeNames.Token)
 
 

@@ -1,8 +1,8 @@
-"""References to .mtlx files, led to layers that are made of them in memory.
+"""Replaces references to .mtlx files by references to layers that are built from them in memory.
 
-USD asks a plug-in for such files, which its wheels lack. A session layer cannot lead a reference elsewhere that lies in
-an instance, and layers are shared by all stages of a process: so the layers between the root and a document are copied
-in memory, and the copies name one another. Nothing else is copied, and nothing at all where there is no document.
+USD needs a plug-in for such files, which its wheels lack. A session layer cannot change a reference inside an instance,
+and layers are shared by all stages of a process. So the layers between the root and a document are copied in memory,
+and the copies refer to one another. Other layers are not copied; without documents nothing is.
 """
 
 from functools import partial
@@ -15,95 +15,99 @@ from warp_ir.usd.values.report import Report, Unreadable
 _Layers = dict[str, Sdf.Layer]
 
 
-def with_documents(stage: Usd.Stage, report: Report) -> tuple[Sdf.Layer, ...]:
-    """What to open instead of a stage, so that its .mtlx files are read: a root layer, and the layers that it needs.
+def layers_with_mtlx(stage: Usd.Stage, report: Report) -> tuple[Sdf.Layer, ...]:
+    """The layers to open instead of a stage, so that its .mtlx files are read: the root layer, and the layers it needs.
 
-    The session layer is changed in place: it has to be the stage's own.
+    The stage's session layer is changed in place.
 
     Args:
-        stage: As it is composed without the documents.
-        report: Where documents that cannot be read are named.
+        stage: The stage, composed without the documents.
+        report: Receives warnings of documents that cannot be read.
 
     Returns:
-        Nothing where the stage can stay as it is. The layers must be held until the new stage is open.
+        () if the stage needs no change. The layers must stay referenced until the new stage is open.
     """
     if not any(".mtlx" in str(error).lower() for error in stage.GetCompositionErrors()):
-        return ()  # looking for paths in a damaged layer could end the process
-    used = [layer for layer in stage.GetUsedLayers() if layer]
-    named = {layer: _dependencies(layer) for layer in used}
-    wanted = {path for paths in named.values() for path in paths.values() if _is_mtlx(path)}
+        return ()  # searching a damaged layer for paths could end the process
+    used_layers = [layer for layer in stage.GetUsedLayers() if layer]
+    dependencies = {layer: _dependencies(layer) for layer in used_layers}
+    wanted = {path for paths in dependencies.values() for path in paths.values() if _is_mtlx(path)}
     if not wanted or Sdf.FileFormat.FindByExtension("mtlx") is not None:
         return ()
     if not available():
         report.warn("/", f"{len(wanted)} .mtlx files cannot be read: the package MaterialX is not installed")
         return ()
-    documents = {path: _read(path, report) for path in sorted(wanted)}
+    documents = {path: _document_layer(path, report) for path in sorted(wanted)}
     copies: _Layers = {}
     while True:
         known = documents.keys() | copies.keys()
         new = [
-            layer for layer in used if layer.identifier not in copies and not known.isdisjoint(named[layer].values())
+            layer
+            for layer in used_layers
+            if layer.identifier not in copies and not known.isdisjoint(dependencies[layer].values())
         ]
         if not new:
             break
-        copies |= {layer.identifier: Sdf.Layer.CreateAnonymous(_tag(layer)) for layer in new}
+        copies |= {layer.identifier: Sdf.Layer.CreateAnonymous(_copy_name(layer)) for layer in new}
     session, root = stage.GetSessionLayer(), stage.GetRootLayer()
     copies[session.identifier] = session
-    for layer in used:
+    for layer in used_layers:
         if layer.identifier in copies:
             copy = copies[layer.identifier]
             if layer != session:
                 copy.TransferContent(layer)
-            UsdUtils.ModifyAssetPaths(copy, partial(_led, layer, documents | copies))
+            UsdUtils.ModifyAssetPaths(copy, partial(_remapped_path, layer, documents | copies))
     return copies.get(root.identifier, root), *copies.values(), *documents.values()
 
 
 def _dependencies(layer: Sdf.Layer) -> dict[str, str]:
-    """The asset paths of sublayers, references and payloads: as authored, and what identifies them."""
+    """Asset paths of sublayers, references and payloads: as authored, with the identifiers they resolve to."""
     return {path: _identifier(layer, path) for path in layer.GetCompositionAssetDependencies()}
 
 
 def _identifier(layer: Sdf.Layer, path: str) -> str:
-    """The identifier of the layer that a path in another one leads to."""
+    """Identifier of the layer that a path in another layer refers to."""
     try:
-        found = Sdf.Layer.FindRelativeToLayer(layer, path)
+        target = Sdf.Layer.FindRelativeToLayer(layer, path)
     except Tf.ErrorException:
-        found = None
-    return str(found.identifier) if found else _absolute(layer, path)
+        target = None
+    return str(target.identifier) if target else _absolute(layer, path)
 
 
 def _absolute(layer: Sdf.Layer, path: str) -> str:
+    """The absolute form of a path in a layer, if it has one."""
     try:
         return str(layer.ComputeAbsolutePath(path))
     except Tf.ErrorException:
         return path
 
 
-def _led(layer: Sdf.Layer, elsewhere: _Layers, path: str) -> str:
-    """A path in a layer as it is written in the copy, which lies nowhere and leads where it should."""
+def _remapped_path(layer: Sdf.Layer, replacements: _Layers, path: str) -> str:
+    """An asset path as the anonymous copy of a layer needs it: absolute, or the identifier of a replacement."""
     if not path or path.startswith(("`", "anon:")):
-        return elsewhere[path].identifier if path in elsewhere else path
-    found = elsewhere.get(_identifier(layer, path))
-    if found is not None:
-        return str(found.identifier)
+        return replacements[path].identifier if path in replacements else path
+    replacement = replacements.get(_identifier(layer, path))
+    if replacement is not None:
+        return str(replacement.identifier)
     absolute = _absolute(layer, path)
-    # A name that is searched for, and not found, may be a pattern: images by tiles lie beside the layer.
+    # An unresolved search path may be a UDIM pattern, which is relative to the layer.
     return _absolute(layer, f"./{path}") if absolute == path and "<UDIM>" in path else absolute
 
 
 def _is_mtlx(path: str) -> bool:
+    """Whether a path names a MaterialX document, in a package or not."""
     path = Sdf.Layer.SplitIdentifier(path)[0]
     return (Ar.SplitPackageRelativePathInner(path)[1] or path).lower().endswith(".mtlx")
 
 
-def _tag(layer: Sdf.Layer) -> str:
-    """The name of a copy, of which the extension decides the format: packages cannot be made."""
+def _copy_name(layer: Sdf.Layer) -> str:
+    """The name of a layer's copy; its extension selects a format that can be created (packages cannot)."""
     name = str(layer.GetDisplayName())
     return name if name.endswith((".usda", ".usdc", ".usd")) else f"{name}.usda"
 
 
-def _read(path: str, report: Report) -> Sdf.Layer:
-    """The layer of a document; an empty one, and a line, if it cannot be read."""
+def _document_layer(path: str, report: Report) -> Sdf.Layer:
+    """The layer of a document; an empty one, with a warning, if it cannot be read."""
     try:
         layer, left_out = materialx_layer(path)
     except Unreadable as trouble:

@@ -1,4 +1,4 @@
-"""Opening a stage: errors in one line, USD's own diagnostics collected instead of spilled."""
+"""Opens a stage: errors become one line, and USD's diagnostics are collected."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -8,17 +8,17 @@ from pathlib import Path
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from warp_ir.scene import InputError
-from warp_ir.usd.stage.crate_validation import check_sizes
-from warp_ir.usd.stage.mtlx_layers import with_documents
+from warp_ir.usd.stage.crate_validation import validate_crate
+from warp_ir.usd.stage.mtlx_layers import layers_with_mtlx
 from warp_ir.usd.values.report import Report
 
-_SHOWN = 5
-"""How many composition errors, and other diagnostics, are listed; the rest is counted."""
+_MAX_LISTED = 5
+"""Maximum number of composition errors that are listed; the rest is counted."""
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Keep USD's diagnostics off stderr; what matters among them the loader finds and says itself."""
+def quiet_diagnostics() -> Iterator[None]:
+    """Keep USD's diagnostics off stderr; the readers report those that matter."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -38,12 +38,12 @@ def open_stage(
     """Open a stage with all its payloads.
 
     Args:
-        path: Of the root layer.
-        report: Where composition errors go.
-        mask: Paths of prims; if there are any, the stage holds only them, what is above, below and related to them.
-        needed: Paths of prims that it holds beside those of a mask, if there are such.
+        path: The root layer.
+        report: Receives composition errors.
+        mask: Paths of prims; if not empty, the stage contains only them, their ancestors, descendants and relations.
+        needed: Paths of further prims that a masked stage contains, if they exist.
         variants: Selections `/prim{set=selection}`, stronger than those of the file.
-        session_layer: A layer that is stronger than the file.
+        session_layer: A layer with opinions stronger than the file's.
 
     Raises:
         InputError: A file is missing, is a directory, or is not readable as USD; a path, variant set or selection
@@ -51,68 +51,69 @@ def open_stage(
     """
     for text in mask:
         path_of_mask = Sdf.Path(text) if Sdf.Path.IsValidPathString(text) else Sdf.Path()
-        # A relative path of a prim is an IsAbsoluteRootOrPrimPath as well.
+        # IsAbsoluteRootOrPrimPath is true for relative prim paths as well.
         if not (path_of_mask.IsAbsolutePath() and path_of_mask.IsAbsoluteRootOrPrimPath()):
             raise InputError(f"mask: {text!r} is not the absolute path of a prim")
-    root = _layer(path)
-    # One of our own, so that selecting variants changes nothing that another stage shares.
+    root = _open_layer(path)
+    # An own session layer: variant selections must not change layers that another stage shares.
     session = Sdf.Layer.CreateAnonymous("session")
     if session_layer is not None:
-        stronger = _layer(session_layer)
+        stronger = _open_layer(session_layer)
         session.subLayerPaths.append(stronger.identifier)
     wanted = [text for text in needed if Sdf.Path.IsValidPathString(text) and Sdf.Path(text).IsPrimPath()]
     paths = [*mask, *wanted] if mask else []
     try:
-        stage = _composed(root, session, paths)
+        stage = _compose(root, session, paths)
         for text in mask:
             if not stage.GetPrimAtPath(text):
                 raise InputError(f"mask: there is no prim {text}")
         for text in variants:
             _select_variant(stage, text)
-        instead = with_documents(stage, report)
-        if instead:
-            stage = _composed(instead[0], session, paths)
+        layers = layers_with_mtlx(stage, report)
+        if layers:
+            stage = _compose(layers[0], session, paths)
     except (Tf.ErrorException, RuntimeError) as error:
-        raise _unopened(path, error) from None
-    _name_composition_errors(stage, report)
+        raise _open_error(path, error) from None
+    _report_composition_errors(stage, report)
     return stage
 
 
-def _name_composition_errors(stage: Usd.Stage, report: Report) -> None:
-    """One line for each file that is missing and each other error, with the prims that lack something for it."""
-    # USD composes on all cores: the order is any.
-    found = {" ".join(str(error).split()): error for error in stage.GetCompositionErrors()}
-    errors = {text: found[text] for text in sorted(found)}
+def _report_composition_errors(stage: Usd.Stage, report: Report) -> None:
+    """Warns once for each missing file and each other error, with the prims that it affects."""
+    # USD composes on all cores, so the order of errors is arbitrary.
+    by_text = {" ".join(str(error).split()): error for error in stage.GetCompositionErrors()}
+    errors = {text: by_text[text] for text in sorted(by_text)}
     causes: dict[str, list[str]] = {}
     for text, error in errors.items():
-        causes.setdefault(_tidy(_cause(text, stage.GetRootLayer())), []).append(_path_of(error))
-    for text, paths in list(causes.items())[:_SHOWN]:
+        causes.setdefault(_one_line(_cause(text, stage.GetRootLayer())), []).append(_path_of(error))
+    for text, paths in list(causes.items())[:_MAX_LISTED]:
         for path in paths:
             report.warn(path, f"composition: {text}")
-    if len(causes) > _SHOWN:
-        report.warn("/", f"composition: {len(causes) - _SHOWN} more errors")
+    if len(causes) > _MAX_LISTED:
+        report.warn("/", f"composition: {len(causes) - _MAX_LISTED} more errors")
     report.stats["composition_errors"] = len(errors)
 
 
 def _cause(text: str, root: Sdf.Layer) -> str:
-    """What is wrong, without the prim, and without the layer that says so if it is the root."""
-    found = re.search(r" introduced by @([^@]*)@<[^>]*>", text)
-    if found is None:
+    """The cause of an error: its text without the prim, and without the introducing layer if that is the root."""
+    introduced = re.search(r" introduced by @([^@]*)@<[^>]*>", text)
+    if introduced is None:
         return text
-    rest = text[: found.start()] + text[found.end() :].removesuffix(".")
-    return rest if found[1] in (root.identifier, root.realPath) else f"{rest}, which @{found[1]}@ asks for"
+    rest = text[: introduced.start()] + text[introduced.end() :].removesuffix(".")
+    return rest if introduced[1] in (root.identifier, root.realPath) else f"{rest}, which @{introduced[1]}@ asks for"
 
 
 def _path_of(error: object) -> str:
-    """The prim of the stage where something is missing."""
+    """Path of the prim that an error affects."""
     try:
-        path = str(error.rootSite.path)  # type: ignore[attr-defined]
+        path = str(error.rootSite.path)  # type: ignore[attr-defined]  # untyped binding; AttributeError is caught
     except AttributeError:
         return "/"
     return path or "/"
 
 
-def _composed(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.Stage:
+def _compose(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.Stage:
+    """Composes a stage, with a population mask if one is given."""
     if not mask:
         return Usd.Stage.Open(root, session)
     stage = Usd.Stage.OpenMasked(root, session, Usd.StagePopulationMask(list(mask)))
@@ -120,8 +121,8 @@ def _composed(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.S
     return stage
 
 
-def _layer(path: str) -> Sdf.Layer:
-    """A layer.
+def _open_layer(path: str) -> Sdf.Layer:
+    """Opens a layer.
 
     Raises:
         InputError: There is no such file, or it is not readable as USD.
@@ -131,21 +132,22 @@ def _layer(path: str) -> Sdf.Layer:
     if Path(path).is_dir():
         raise InputError(f"{path}: is a directory, not a USD file")
     try:
-        check_sizes(path)
+        validate_crate(path)
         layer = Sdf.Layer.FindOrOpen(path)
     except (Tf.ErrorException, RuntimeError, OSError) as error:
-        raise _unopened(path, error) from None
+        raise _open_error(path, error) from None
     if layer is None:
-        raise InputError(f"{path}: cannot be opened as USD: there is no layer in it")
+        raise InputError(f"{path}: cannot be opened as USD: it contains no layer")
     return layer
 
 
-def _unopened(path: str, error: Exception) -> InputError:
+def _open_error(path: str, error: Exception) -> InputError:
+    """The error for a file that USD refuses, in one line."""
     return InputError(f"{path}: cannot be opened as USD: {first_message(error).removeprefix(f'{path}:')}")
 
 
 def _select_variant(stage: Usd.Stage, text: str) -> None:
-    """Makes the selection `/prim{set=selection}`, one or several, in the session layer."""
+    """Makes the selections `/prim{set=selection}...` in the session layer."""
     match = re.fullmatch(r"(/[^{}]*)((?:\{[^{}=]+=[^{}=]*\})+)", text.strip())
     if match is None:
         raise InputError(f"variant: {text!r} is not of the form /prim{{set=selection}}")
@@ -156,9 +158,9 @@ def _select_variant(stage: Usd.Stage, text: str) -> None:
         sets = prim.GetVariantSets()
         if not sets.HasVariantSet(group):
             raise InputError(f"variant: {match[1]} has no set {group!r}; it has {', '.join(sets.GetNames()) or 'none'}")
-        there = sets.GetVariantSet(group).GetVariantNames()
-        if selection and selection not in there:
-            raise InputError(f"variant: {match[1]}{{{group}}} has no {selection!r}; it has {', '.join(there)}")
+        names = sets.GetVariantSet(group).GetVariantNames()
+        if selection and selection not in names:
+            raise InputError(f"variant: {match[1]}{{{group}}} has no {selection!r}; it has {', '.join(names)}")
         try:
             with Usd.EditContext(stage, stage.GetSessionLayer()):
                 chosen = sets.GetVariantSet(group)
@@ -168,7 +170,7 @@ def _select_variant(stage: Usd.Stage, text: str) -> None:
 
 
 def time_code(stage: Usd.Stage, time: float | str | None) -> Usd.TimeCode:
-    """The moment to load: as given, else the stage's start, as usdrecord does; "default" is the default time."""
+    """The time to load: as given, else the stage's start, as in usdrecord; "default" is the default time."""
     if time == "default":
         return Usd.TimeCode.Default()
     if time is not None:
@@ -180,7 +182,7 @@ def time_code(stage: Usd.Stage, time: float | str | None) -> Usd.TimeCode:
 
 
 def up_axis(stage: Usd.Stage, report: Report) -> str:
-    """Up axis, Y or Z; anything else in the file is reported and read as Y."""
+    """Up axis, Y or Z; any other value is reported and read as Y."""
     axis = stage.GetRootLayer().pseudoRoot.GetInfo(UsdGeom.Tokens.upAxis) or UsdGeom.Tokens.y
     if axis not in (UsdGeom.Tokens.y, UsdGeom.Tokens.z):
         report.warn("/", f"upAxis is '{axis}', neither Y nor Z; Y is used")
@@ -189,16 +191,17 @@ def up_axis(stage: Usd.Stage, report: Report) -> str:
 
 
 def first_message(error: Exception) -> str:
-    """The first message of an exception of USD, in one line and without its source location."""
+    """The first message of a USD exception, in one line and without its source location."""
     try:
         text = str(error)
-    except UnicodeDecodeError:  # it quotes the file, which is no text
-        return "the file is damaged, or no USD file"
+    except UnicodeDecodeError:  # the message quotes binary content of the file
+        return "the file is damaged or not a USD file"
     messages = re.findall(r": '(.*?)'\s*(?=\n\s*Error in|$)", text, flags=re.DOTALL)
-    return _tidy(messages[0] if messages else text)
+    return _one_line(messages[0] if messages else text)
 
 
-def _tidy(message: str) -> str:
-    # Layers in memory are called by where they lie there, and by their name.
+def _one_line(message: str) -> str:
+    """A message in one line of at most 300 characters."""
+    # Identifiers of anonymous layers contain an address, which differs between runs.
     words = re.sub(r"anon:0x[0-9a-fA-F]+:", "", " ".join(message.split()))
     return words if len(words) <= 300 else words[:299] + "…"

@@ -50,8 +50,7 @@ def test_a_camera_in_a_ball_that_glows_outwards(tmp_path):
     """From inside a closed surface that emits from its outer side nothing is lit: said, and so it is."""
     scene = load(tmp_path, ball() + CAMERA % (0.1, 100, 0))
     assert said(scene) == [
-        "/Ball: the camera is inside it, and it emits outwards only (doubleSided, orientation):"
-        " nothing lights what is seen"
+        "/Ball: the camera is inside it, and it emits outwards only (doubleSided, orientation): the picture is black"
     ]
 
 

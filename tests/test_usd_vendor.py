@@ -176,7 +176,7 @@ def test_a_base_colour_that_is_not_understood_is_grey(tmp_path):
     text = material_text("color3f inputs:baseColor.connect = </A/N.outputs:out>", shader="mine").rstrip()[:-1]
     node = 'def Shader "N" {\n uniform token info:id = "clouds"\n color3f outputs:out\n}\n}\n'
     scene = load(tmp_path, text + node + mesh())
-    assert only_material(scene).albedo == (0.18,) * 3 and warned(scene, "/A", "clouds is not understood")
+    assert only_material(scene).albedo == (0.18,) * 3 and warned(scene, "/A", "clouds is not supported")
 
 
 def test_what_is_understood_exactly_comes_first(tmp_path):
