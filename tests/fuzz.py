@@ -26,7 +26,7 @@ def seeds(folder: Path) -> list[Path]:
         if source.stat().st_size > 200_000:
             continue  # bigger, not more varied
         binary, package = folder / f"{source.stem}.usdc", folder / f"{source.stem}.usdz"
-        Sdf.IrradianceLayer.FindOrOpen(str(source)).Export(str(binary))
+        Sdf.Layer.FindOrOpen(str(source)).Export(str(binary))
         UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(binary)), str(package))
         found += [source, binary, package]
     return found
@@ -275,7 +275,7 @@ _VALUES = {
 }
 
 
-def misuse(layer: Sdf.IrradianceLayer, rng: np.random.Generator) -> None:
+def misuse(layer: Sdf.Layer, rng: np.random.Generator) -> None:
     """A few opinions of a layer replaced: wrong lengths, types, indices; cycles; targets that are missing."""
     paths: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(path) if path.IsPrimPath() else None)
@@ -321,8 +321,8 @@ def mutate(sources: list[Path], folder: Path, seed: int) -> Path:
     if seed % 2:  # well-formed, and senseless
         rich = next(source for source in sources if source.name == "rich.usda")
         path = folder / f"{seed}{'.usda' if seed % 4 == 1 else '.usdc'}"
-        layer = Sdf.IrradianceLayer.CreateAnonymous(".usda")
-        layer.TransferContent(Sdf.IrradianceLayer.FindOrOpen(str(rich)))
+        layer = Sdf.Layer.CreateAnonymous(".usda")
+        layer.TransferContent(Sdf.Layer.FindOrOpen(str(rich)))
         misuse(layer, rng)
         layer.Export(str(path))
         return path

@@ -5,9 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from tests.test_usd_look import RGBA, ST, mesh
+from tests.test_usd_network import RGBA, ST, mesh
 from tests.test_usd_material import load, material_text, only_material, warned
-from tests.test_usd_texture import write
+from tests.test_usd_images import write
 from warp_ir.scene import Wrap
 from warp_ir.usd.images.asset import srgb_to_linear
 

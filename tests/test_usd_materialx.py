@@ -8,9 +8,9 @@ import pytest
 from pxr import Sdf
 
 import warp_ir as ir
-from tests.test_usd_look import ST
+from tests.test_usd_network import ST
 from tests.test_usd_material import QUADS, load, only_material, warned
-from tests.test_usd_texture import write
+from tests.test_usd_images import write
 from warp_ir.usd.stage import materialx, mtlx_layers
 from warp_ir.usd.values.source_color_space import srgb_to_linear
 
@@ -169,7 +169,7 @@ def test_the_colour_space_of_a_document(looks):
 def test_what_others_share_is_left_alone(looks):
     """Layers on the disk, and those that the process has open, are as they were."""
     (looks / "stage.usda").write_text("#usda 1.0\n" + ROOT + mesh())
-    theirs = Sdf.IrradianceLayer.FindOrOpen(str(looks / "stage.usda"))
+    theirs = Sdf.Layer.FindOrOpen(str(looks / "stage.usda"))
     before = theirs.ExportToString()
     ir.load_usd(looks / "stage.usda")
     assert theirs.ExportToString() == before and not theirs.dirty

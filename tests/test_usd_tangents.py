@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.test_usd_look import RAW, UNPACK, mesh, textured
+from tests.test_usd_network import RAW, UNPACK, mesh, textured
 from tests.test_usd_material import load
-from tests.test_usd_texture import write
+from tests.test_usd_images import write
 from warp_ir.usd.geometry.tangents import smooth_tangents
 
 FOLD = np.array([(0, 0, 0), (0, 0, -1), (1, 0, 0), (1, 0, -1), (0, 1, 0), (0, 1, -1)], float)

@@ -117,7 +117,7 @@ def picture(folder, text, suffix=".usda", **settings):
     path.write_text("#usda 1.0\n" + text)
     if suffix != ".usda":
         binary = folder / "stage.usdc"
-        Sdf.IrradianceLayer.FindOrOpen(str(path)).Export(str(binary))
+        Sdf.Layer.FindOrOpen(str(path)).Export(str(binary))
         path = binary
     if suffix == ".usdz":
         path = folder / "stage.usdz"

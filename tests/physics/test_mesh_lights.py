@@ -8,7 +8,7 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
-from tests.physics.test_light_control import (
+from tests.physics.test_light_modifiers import (
     DOWN,
     LAMP,
     SHAPINGS,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from pxr import Tf, UsdGeom
 
-from tests.test_usd_look import mesh, textured
+from tests.test_usd_network import mesh, textured
 from tests.test_usd_material import QUADS, diffuse, load, material_text, only_material
-from tests.test_usd_texture import write
+from tests.test_usd_images import write
 from warp_ir import InputError, RenderSettings, load_usd
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdUtils
 
 import warp_ir as ir
 from tests.test_usd_material import QUADS, load, material_text, only_material, warned
-from tests.test_usd_texture import write
+from tests.test_usd_images import write
 from warp_ir.scene import Wrap
 from warp_ir.usd.images.asset import srgb_to_linear
 
