@@ -10,7 +10,7 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import placed
-from tests.physics.test_light_modifiers import DOWN, everything, lamp_profile
+from tests.physics.scenes import DOWN, everything, lamp_profile
 from warp_ir.cli import main
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_moments

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 import warp_ir as ir
-from tests.physics.closed_form import placed, render, rotation_x
-from tests.physics.test_invariance import room
+from tests.physics.closed_form import assert_agree, placed, render, rotation_x
+from tests.physics.scenes import box_with_lights, everything, glowing_room
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.metrics import relative_mse
 from warp_ir.procedural import cornell_box, floor, furnace, mesh, sphere
@@ -28,7 +28,7 @@ def smooth_ball():
     return dataclasses.replace(scene, meshes=(*scene.meshes, ball))
 
 
-@pytest.mark.parametrize("make", [cornell_box, room, smooth_ball])
+@pytest.mark.parametrize("make", [cornell_box, box_with_lights, smooth_ball])
 @pytest.mark.parametrize(
     "estimator, absorption", [("keller", "fractional"), ("keller", "roulette"), ("vpl", "roulette")]
 )
@@ -41,11 +41,21 @@ def test_vpls_agree_with_path(make, estimator, absorption):
     common = dict(width=12, height=12)
     one = render(make(), estimator, iterations=24 if estimator == "keller" else 256, absorption=absorption, **common)
     two = render(make(), "path", iterations=1024, **common)
-    error = np.hypot(one.standard_error(), two.standard_error())
-    z = (one.radiance() - two.radiance()) / np.maximum(error, 1e-12)
-    assert (np.abs(z) > 4.5).mean() <= 0.005
-    shift = float(one.radiance().mean() - two.radiance().mean())
-    assert abs(shift) < 4.0 * float(one.standard_error().mean())
+    assert_agree(one, two, outliers=0.005)
+
+
+@pytest.mark.parametrize("make", [everything, glowing_room])
+@pytest.mark.parametrize("estimator, absorption", [("keller", "fractional"), ("vpl", "roulette")])
+def test_vpls_agree_with_path_under_modified_lights(make, estimator, absorption):
+    """Shaping, textures, links and missing shadows, of lights and of surfaces that emit: all of it at once.
+
+    Of 432 values at most 1 % may exceed 4.5: 4 of them, where rare bright paths make the tails of `path` long.
+    """
+    common = dict(width=12, height=12)
+    iterations = 32 if estimator == "keller" else 256
+    one = render(make(), estimator, iterations=iterations, light_paths=512, absorption=absorption, **common)
+    two = render(make(), "path", iterations=4096, **common)
+    assert_agree(one, two, outliers=0.01)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, placed, render
-from tests.physics.test_smooth_surfaces import ball, towards
+from tests.physics.scenes import ball, towards
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, quad
 from warp_ir.scene import Instances, LightKind, Texture
