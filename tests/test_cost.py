@@ -109,6 +109,7 @@ SCENES = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_the_estimate_is_good_to_a_fifth(scene):
     """The bytes that are said are those of all arrays of the uploaded scene, within 20 %."""
@@ -129,6 +130,7 @@ def through_a_lens():
     return replace(scene, camera=replace(scene.camera, lens_radius=0.1, focus_distance=1.0))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "scene",
     [cornell_box(), lamps(), mapped(), through_a_lens(), moving()],

@@ -21,6 +21,8 @@ from warp_ir.device_scene import SceneData
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 _REGISTERS, _FRAME = 0x2F, 0x11  # EIATTR_REGCOUNT, EIATTR_FRAME_SIZE

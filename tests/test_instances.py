@@ -96,6 +96,7 @@ def test_bounds_and_areas_of_many_copies(uneven):
     np.testing.assert_allclose(areas_of_copies(points, triangles, matrices), exact, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_picture_of_instances_is_that_of_copies(device):
     """The camera sees the same meshes, colours, depths and normals; but for single rays at edges, by rounding."""
     settings = ir.RenderSettings(width=96, height=96, iterations=2, estimator="path")
@@ -107,6 +108,7 @@ def test_a_picture_of_instances_is_that_of_copies(device):
         assert close[same].mean() > 0.999, name
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_light_among_instances_is_that_among_copies(estimator, device):
     """The two pictures have the same mean within their standard errors."""
@@ -161,6 +163,7 @@ def _look(first: int, scene: SceneData, seen: wp.array[wp.vec3], measured: wp.ar
     lit[i] += wp.where(visible(scene, q, wp.vec4(p[0], p[1], p[2], 1.0)), 1, 0)
 
 
+@pytest.mark.extended
 def test_cut_outs_and_textures_of_instances_are_those_of_copies(launcher):
     """The same rays pass, the same texels are seen, also by shadow rays; but for single rays at edges, by rounding."""
     n, results = 20_000, []
@@ -176,6 +179,7 @@ def test_cut_outs_and_textures_of_instances_are_those_of_copies(launcher):
     assert 0.1 < (seen.std(axis=1) > 0.01).mean() < 0.9  # balls and room are both seen
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device):
     """What the camera sees, and the light that falls through the holes."""
@@ -190,6 +194,7 @@ def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device)
     assert_mean(one, float(other.radiance().mean()), bias=0.01)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_white_instances_vanish_in_white_light(estimator, device):
     """Surfaces of albedo 1 under a sky of radiance 1 have radiance 1, whatever they are and wherever they stand."""
@@ -209,6 +214,7 @@ def test_white_instances_vanish_in_white_light(estimator, device):
     assert abs(seen.mean() - 1.0) < 5.0 * error + 1e-3  # paths end by roulette at 0.999
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "keller", "path"])
 def test_a_furnace_of_instances(estimator, device):
     """A closed room of tiles that all emit reaches Le / (1 - ρ): instances that emit are written out."""
@@ -259,6 +265,7 @@ def _wander(first: int, scene: SceneData, escapes: wp.array[wp.int32], blocked: 
         direction = square_to_cosine_hemisphere(u, hit.normal)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 10.0), (1e6, 1e11)])
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.parametrize("turned", [False, True])

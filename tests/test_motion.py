@@ -265,6 +265,7 @@ def coverage(n, shift, half):
     return (np.abs(x - shift * times) < half).mean(axis=1).reshape(n, 16).mean(axis=1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("what", ["transform", "points", "camera"])
 def test_coverage_of_what_moves(tmp_path, what, device):
     """A quad that moves while the shutter is open covers a pixel for a share of the time: a trapezium.
@@ -300,6 +301,7 @@ def test_coverage_of_what_moves(tmp_path, what, device):
     np.testing.assert_allclose(sharp, coverage(n, 0.0, half), atol=4 * noise)
 
 
+@pytest.mark.extended
 def test_light_that_moves_lights_with_its_mean(tmp_path):
     """A lamp whose intensity rises from 0 to 2 while the shutter is open lights like one of 1."""
     lamp = """def SphereLight "L" {
@@ -350,6 +352,7 @@ def test_moments_are_as_many_as_what_moves_allows(tmp_path, monkeypatch):
     assert len(scene.shutter) == MOMENTS // 2 and any("/C" in line and "8 moments" in line for line in scene.warnings)
 
 
+@pytest.mark.extended
 def test_blur_is_not_filtered_away():
     """With and without the filter a blurred picture has the same mean."""
     scene = ir.load_usd(TURNTABLE, time=5.0)

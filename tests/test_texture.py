@@ -8,6 +8,8 @@ from warp_ir.image.mipmap import mip_chain, resized
 from warp_ir.scene import Texture, Wrap
 from warp_ir.texture import TextureTable, coordinates, lookup, mean_on_triangles, mip_level, upload_textures
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

@@ -249,6 +249,7 @@ def test_many_materials_that_share_a_graph_are_bounded(looks, monkeypatch):
     assert warned(load(looks, ROOT + mesh()), "more than 5 nodes")
 
 
+@pytest.mark.extended
 def test_twins_by_reference_and_inline():
     """A Cornell box whose materials are a document equals the one that holds them itself."""
     folder = real_file("cornell_pablode/cornell-box")

@@ -616,6 +616,7 @@ def test_the_same_scene_in_every_kind_of_file(tmp_path, image):
     assert films[0].aov("albedo").std() > 0.01
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "file, images",
     [

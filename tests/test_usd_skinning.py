@@ -219,6 +219,7 @@ def test_outside_of_a_skel_root_nothing_is_skinned(tmp_path):
     assert np.linalg.norm(area_vectors(scene.meshes[0]), axis=1).sum() == pytest.approx(2.0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("name", "time"), [("CesiumMan", 10.0), ("RiggedSimple", 10.0), ("RiggedFigure", 0.0)])
 def test_real_figures_are_where_usd_bakes_them(name, time):
     """BakeSkinning, on a layer of its own, puts the points where they are drawn (to its float32)."""

@@ -243,6 +243,7 @@ def _survives(file: Path) -> None:
     assert all("\n" not in line for line in scene.warnings)
 
 
+@pytest.mark.extended
 def test_some_real_files_survive():
     """Every 16th file of the collection loads into consistent records, or is refused in one line."""
     for file in need_real_files()[::16]:

@@ -18,6 +18,11 @@ from warp_ir.scene import LightKind
 SCENES = Path(__file__).parents[2] / "scenes_usd"
 
 
+def extended(*values):
+    """Parameters for which a test is in the extended tier."""
+    return pytest.param(*values, marks=pytest.mark.extended)
+
+
 def smooth_ball():
     """A smooth-shaded ball in the Cornell box: interpolated normals, and colours by corner."""
     points, triangles = sphere(100.0, level=2)
@@ -28,9 +33,9 @@ def smooth_ball():
     return dataclasses.replace(scene, meshes=(*scene.meshes, ball))
 
 
-@pytest.mark.parametrize("make", [cornell_box, box_with_lights, smooth_ball])
+@pytest.mark.parametrize("make", [cornell_box, extended(box_with_lights), extended(smooth_ball)])
 @pytest.mark.parametrize(
-    "estimator, absorption", [("keller", "fractional"), ("keller", "roulette"), ("vpl", "roulette")]
+    "estimator, absorption", [("keller", "fractional"), extended("keller", "roulette"), ("vpl", "roulette")]
 )
 def test_vpls_agree_with_path(make, estimator, absorption):
     """Per pixel the difference of two estimates over its standard error is a standard normal; so is the mean's.
@@ -44,6 +49,7 @@ def test_vpls_agree_with_path(make, estimator, absorption):
     assert_agree(one, two, outliers=0.005)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("make", [everything, glowing_room])
 @pytest.mark.parametrize("estimator, absorption", [("keller", "fractional"), ("vpl", "roulette")])
 def test_vpls_agree_with_path_under_modified_lights(make, estimator, absorption):
@@ -82,6 +88,7 @@ def repeated(estimator, iterations, *, light_paths=64, seeds=16):
     return np.array([f.radiance() for f in films], np.float64), np.array([f.standard_error() for f in films])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_standard_error_is_honest(estimator):
     """Repeated renders scatter as their standard errors say: the Z scores against their common mean have variance 1.
@@ -94,6 +101,7 @@ def test_standard_error_is_honest(estimator):
     assert 0.5 < (z**2).mean() < 1.5
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_error_falls_as_one_over_root_n(estimator):
     """The log-log slope of the spread over the number of (independent) iterations is -1/2.
@@ -106,6 +114,7 @@ def test_error_falls_as_one_over_root_n(estimator):
     assert -0.68 < slope < -0.32
 
 
+@pytest.mark.extended
 def test_light_paths_are_of_low_discrepancy():
     """Eight times the points on a rectangular light leave not 1/8 of the variance, as random ones, but 1/64 or less.
 
@@ -150,6 +159,7 @@ def small_box():
     return scene, common, render(scene, "vpl", iterations=1024, **common).radiance()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("filtered", [False, True])
 def test_target_error_is_the_true_error(filtered, small_box):
     """A render to a target error of 5 % stops there, and its relative RMS error against the truth is 5 %, or less.

@@ -12,6 +12,8 @@ import warp_ir as ir
 from tests.physics.closed_form import placed, rotation
 from tests.physics.level import assert_level, at, check, irradiance, light, load, material, mesh, rectangle
 
+pytestmark = pytest.mark.extended
+
 GLOW = material("color3f inputs:diffuseColor = (0, 0, 0)\n        color3f inputs:emissiveColor = (2, 2, 2)", "Glow")
 BOUND = "rel material:binding = </Glow>"
 API = '"MaterialBindingAPI"'

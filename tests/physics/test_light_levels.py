@@ -28,6 +28,8 @@ from tests.physics.level import (
 )
 from tests.stages import write_image
 
+pytestmark = pytest.mark.extended
+
 DOWN = rotation(0, -90.0)
 TILTED = rotation(1, 20.0) @ rotation(0, -70.0)
 LINEAR = TILTED @ np.diag([1.6, 0.7, 0.5])

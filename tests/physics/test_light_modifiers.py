@@ -32,6 +32,8 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cube, mesh
 from warp_ir.scene import LightKind, Shaping
 
+pytestmark = pytest.mark.extended
+
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("shaping", SHAPINGS)

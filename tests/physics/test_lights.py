@@ -12,6 +12,8 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import floor
 from warp_ir.scene import LightKind
 
+pytestmark = pytest.mark.extended
+
 STRETCH = np.diag([2.0, 1.0, 0.5])
 SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
 

@@ -13,6 +13,8 @@ from tests.physics.closed_form import bilinear, placed, rotation
 from tests.physics.level import EYE, assert_level, floor, image_nodes, irradiance, level, light, load, mesh, srgb
 from tests.stages import write_image
 
+pytestmark = pytest.mark.extended
+
 SUN = light(
     "DistantLight", f"float inputs:angle = 0\n    float inputs:intensity = {math.pi}", placed(rotation(0, -90.0))
 )

@@ -33,6 +33,8 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cube, floor, mesh, sphere
 from warp_ir.scene import LightKind, Shaping
 
+pytestmark = pytest.mark.extended
+
 
 def over_floor(light, estimator, device, **settings):
     return render(

@@ -12,6 +12,8 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, quad
 from warp_ir.scene import Instances, LightKind, Texture
 
+pytestmark = pytest.mark.extended
+
 ALBEDO = 0.5
 TEXEL = np.array([0.75, -0.5, 1.25])  # exact in the halves that textures are kept in
 TILT = TEXEL / np.linalg.norm(TEXEL)

@@ -9,6 +9,8 @@ from tests.physics.closed_form import placed, rotation
 from tests.physics.level import EYE, assert_level, at, check, floor, level, light, load, mesh, panel
 from tests.stages import photometry, sky_directions, write_image
 
+pytestmark = pytest.mark.extended
+
 TURN = rotation(1, 65.0) @ rotation(0, 25.0) @ rotation(2, -40.0)
 
 

@@ -9,6 +9,8 @@ from tests.physics.scenes import ball, towards
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.scene import LightKind
 
+pytestmark = pytest.mark.extended
+
 ALBEDO = 0.8
 
 

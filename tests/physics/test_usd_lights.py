@@ -13,6 +13,8 @@ from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed,
 from warp_ir.procedural import floor
 from warp_ir.scene import LightKind
 
+pytestmark = pytest.mark.extended
+
 SCALE = (1.6, 0.7, 0.5)
 AT = (0.3, 2.0, 0.1)
 INTENSITY, EXPOSURE = 3.0, 1.0
