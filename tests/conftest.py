@@ -7,7 +7,7 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 _LAUNCHING = {"Launcher", "Renderer", "device", "exec", "launcher", "main", "render", "trace_vpls", "upload_scene"}
-"""Fixtures and names by which most tests that launch kernels can be told."""
+"""Fixtures and names by which most tests that launch kernels can be told; all of tests/physics do."""
 
 
 def pytest_addoption(parser):
@@ -25,7 +25,7 @@ def pytest_generate_tests(metafunc):
 def pytest_collection_modifyitems(items):
     """Tests that launch kernels share a process under `--dist loadgroup`, so that no module is compiled twice."""
     for item in items:
-        if _LAUNCHING & {*item.fixturenames, *item.function.__code__.co_names}:
+        if item.path.parent.name == "physics" or _LAUNCHING & {*item.fixturenames, *item.function.__code__.co_names}:
             item.add_marker(pytest.mark.xdist_group("kernels"))
 
 
