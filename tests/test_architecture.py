@@ -228,6 +228,8 @@ def retired_words(text):
 
 def retired_names(text):
     """Lines of a program with names that have a retired word as a part, and what to call it instead."""
+    if not re.search("|".join(RETIRED_NAMES), text, flags=re.IGNORECASE):
+        return
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.NAME:
             for word in set(token.string.lower().split("_")) & RETIRED_NAMES.keys():

@@ -157,6 +157,7 @@ def test_an_edge_out_of_focus_is_the_integral_of_the_disk(device):
     np.testing.assert_allclose(rows, share, atol=4 * 0.5 / math.sqrt(n * iterations))
 
 
+@pytest.mark.extended
 def test_what_is_in_focus_is_sharp(device):
     """At the focus distance a lens changes nothing but noise: alpha is that of the pinhole, exactly."""
     corners = [(-0.37, -0.61, -2), (0.83, -0.61, -2), (0.83, 0.29, -2), (-0.37, 0.29, -2)]

@@ -60,6 +60,7 @@ def test_one_sees_into_a_room(tmp_path, view):
     assert ((pixels[..., 1] > 0.9) & (pixels[..., 0] < 0.2)).any()
 
 
+@pytest.mark.extended
 def test_empty_scene_and_directional_vpls(tmp_path):
     """Nothing at all is a picture, and so is light that comes from nowhere in particular."""
     picture_vpls(Scene(), cloud(np.zeros((0, 3)), np.zeros((0, 3))), tmp_path / "a.png", width=32)

@@ -18,7 +18,9 @@ def truncation(albedo, paths=PATHS):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
-@pytest.mark.parametrize("albedo", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize(
+    "albedo", [pytest.param(0.2, marks=pytest.mark.extended), 0.5, pytest.param(0.8, marks=pytest.mark.extended)]
+)
 def test_radiance_is_emission_over_absorption(estimator, shape, albedo, device):
     """A closed room of emission Le and albedo ρ has radiance Le / (1 - ρ) everywhere."""
     film = render(furnace(albedo, 1.0, shape=shape, level=3), estimator, device)
