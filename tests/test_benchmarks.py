@@ -65,6 +65,7 @@ def test_reference_noise_is_not_charged():
     assert abs(run["mean_ratio"]) < 4.0 * 0.05 / math.sqrt(768)
 
 
+@pytest.mark.extended
 def test_our_estimators_keep_to_the_budget_and_come_close():
     """Each estimator takes about the time it is given, and gets the furnace right within 10 %."""
     from methods import own_methods
@@ -121,6 +122,7 @@ def test_compare_fails_if_it_has_become_worse(tmp_path, monkeypatch, factor, cod
     assert run.main(["-k", "furnace_cube", "--estimators", "path", "--compare", str(old)]) == code
 
 
+@pytest.mark.extended
 def test_quick_run_writes_everything(tmp_path):
     """Table, numbers with their circumstances, and plot."""
     pytest.importorskip("matplotlib")

@@ -9,6 +9,8 @@ import warp_ir as ir
 from warp_ir import procedural
 from warp_ir.sampling.sobol import stratum
 
+pytestmark = pytest.mark.extended
+
 BLURRED = ir.RenderSettings(width=48, height=48, iterations=8, light_paths=512)
 
 

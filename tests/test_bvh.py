@@ -9,6 +9,8 @@ import warp as wp
 from warp_ir.bvh import Bvh, BvhForest, intersect
 from warp_ir.procedural import cube, sphere
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

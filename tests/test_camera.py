@@ -112,6 +112,7 @@ def lens_camera(radius, focus, *, window=0.5):
     return ir.Camera(window=(-window, window, -window, window), lens_radius=radius, focus_distance=focus)
 
 
+@pytest.mark.extended
 def test_a_small_light_out_of_focus_is_a_disk(device):
     """A point at depth d is spread evenly over a disk of radius r |1/d - 1/f| on the plane z = -1.
 
@@ -140,6 +141,7 @@ def test_a_small_light_out_of_focus_is_a_disk(device):
     assert picture[reach > blur + half / depth * 1.5 + 2 * window / n].max() == 0.0
 
 
+@pytest.mark.extended
 def test_an_edge_out_of_focus_is_the_integral_of_the_disk(device):
     """Before a half-plane the blur is the share of the disk on its side: ½ + (t √(1 - t²) + asin t)/π, t = x/R."""
     depth, focus, radius = 4.0, 1.0, 0.2
@@ -155,6 +157,7 @@ def test_an_edge_out_of_focus_is_the_integral_of_the_disk(device):
     np.testing.assert_allclose(rows, share, atol=4 * 0.5 / math.sqrt(n * iterations))
 
 
+@pytest.mark.extended
 def test_what_is_in_focus_is_sharp(device):
     """At the focus distance a lens changes nothing but noise: alpha is that of the pinhole, exactly."""
     corners = [(-0.37, -0.61, -2), (0.83, -0.61, -2), (0.83, 0.29, -2), (-0.37, 0.29, -2)]
@@ -196,6 +199,7 @@ def test_a_camera_beyond_all_floats_is_an_error():
         render(glowing(FLOOR, camera), width=4, iterations=1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_clipping_planes_cut_what_the_camera_sees(estimator, orthographic):

@@ -149,6 +149,7 @@ sys.exit(main(sys.argv[1:]))
 """A `warp-ir` that says when the first iteration is done."""
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interruption_leaves_a_picture(tmp_path, number):
     """Ctrl-C and SIGTERM end in a finished picture of what there is and the shell's exit code for them."""
@@ -230,6 +231,7 @@ sys.exit(main(sys.argv[2:]))
 """A `warp-ir` that is interrupted while one of USD's modules imports another."""
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("number", "said"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
 @pytest.mark.parametrize("command", [["info", ROOM], ["render", TURNTABLE, "#.png", "--frames", "1:2"]])
 def test_interruption_while_importing(tmp_path, number, said, command):
@@ -394,6 +396,7 @@ def test_vpls_arrays_and_points(tmp_path, capsys):
     assert len(points.GetWidthsAttr().Get()) == len(arrays["positions"]) >= 32
 
 
+@pytest.mark.extended
 def test_vpls_picture(tmp_path):
     """The .png shows something: more than one colour."""
     assert main(["vpls", ROOM, str(tmp_path / "v.png"), "--light-paths", "32", "-w", "64", "-q"]) == 0
@@ -428,6 +431,7 @@ def test_compare_prints_a_table(tmp_path, capsys):
     assert last.startswith(f"use {recommended['method']} (") and "relMSE 0.01 " in last and "relMSE 0.001 " in last
 
 
+@pytest.mark.extended
 def test_compare_medians_over_seeds(tmp_path, capsys):
     """Every seed is a run of its own, and the rows are the medians."""
     command = ["compare", ROOM, "-q", "--json", str(tmp_path / "c.json"), *COMPARE, "--methods", "vpl", "--seeds", "3"]
@@ -440,6 +444,7 @@ def test_compare_medians_over_seeds(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.extended
 def test_compare_plots(tmp_path):
     """OUTPUT.png is a picture with more than one colour in it."""
     pytest.importorskip("matplotlib")
@@ -447,6 +452,7 @@ def test_compare_plots(tmp_path):
     assert len(np.unique(read_image(tmp_path / "c.png").reshape(-1, 3), axis=0)) > 10
 
 
+@pytest.mark.extended
 def test_compare_without_extras(tmp_path, capsys, monkeypatch):
     """A plot without Matplotlib is an error that names the extra; without the denoiser its method is left out."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -469,6 +475,7 @@ def test_compare_needs_light_and_time(tmp_path, capsys):
     assert "--reference-time: one iteration" in error_of(capsys, "compare", ROOM, *COMPARE, "--reference-time", "1e-9")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("after", "rows"), [(0, 0), (4, 0), (6, 2)])
 def test_compare_interrupted(tmp_path, capsys, monkeypatch, after, rows):
     """A signal ends in what there is: after the reference, its scale and two warm-ups every render is a row."""
@@ -490,6 +497,7 @@ def test_compare_interrupted(tmp_path, capsys, monkeypatch, after, rows):
     assert (tmp_path / "c.json").exists() == (rows > 0)
 
 
+@pytest.mark.extended
 def test_compare_interrupted_between_renders(capsys, monkeypatch):
     """So does Ctrl-C while no render is there to notice it."""
     measured = []

@@ -15,11 +15,13 @@ import warp as wp
 import warp_ir as ir
 import warp_ir.estimators.vpl
 import warp_ir.vpl.emission
-from tests.physics.test_invariance import room
+from tests.physics.scenes import box_with_lights
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import SceneData
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
+
+pytestmark = pytest.mark.extended
 
 wp.set_module_options({"enable_backward": False})
 
@@ -132,7 +134,7 @@ WAITS = ("synchronize", "synchronize_stream", "synchronize_event", "get_event_el
 
 
 @pytest.mark.parametrize(
-    "scene, settings, room",
+    "scene, settings, capacity",
     [
         (cornell_box(), {}, None),
         (cornell_box(), {"max_bounces": 0}, None),
@@ -143,14 +145,14 @@ WAITS = ("synchronize", "synchronize_stream", "synchronize_event", "get_event_el
         (furnace(0.5, 0.0, level=1), {}, None),
     ],
 )
-def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
+def test_iterations_read_nothing_back(scene, settings, capacity, monkeypatch):
     """An iteration does without whatever the host would have to wait for, and comes to the same bits without it.
 
     A launcher that takes the CPU for a device to wait for runs kernels over all rows that there may be.
     """
     settings = ir.RenderSettings(**{"width": 24, "height": 24, "light_paths": 64, "iterations": 3, **settings})
-    if room is not None:
-        monkeypatch.setattr(warp_ir.vpl.emission, "_MOST_ROOM", room)
+    if capacity is not None:
+        monkeypatch.setattr(warp_ir.vpl.emission, "_MAX_CAPACITY", capacity)
     expected = ir.render(scene, settings)
     renderer = Renderer(scene, settings)
     renderer.launcher.waits = False
@@ -162,8 +164,8 @@ def test_iterations_read_nothing_back(scene, settings, room, monkeypatch):
     renderer._report_profile(film)
     np.testing.assert_array_equal(film.radiance(), expected.radiance())
     assert film.counts == expected.counts
-    if room is not None:
-        assert film.counts["vpls"] == 3 * (settings.light_paths + room)
+    if capacity is not None:
+        assert film.counts["vpls"] == 3 * (settings.light_paths + capacity)
 
 
 @pytest.mark.parametrize("name", ["rooms", "house"])
@@ -232,8 +234,8 @@ def test_only_the_launcher_knows_the_device():
 def test_cuda_agrees_with_cpu(estimator):
     """The same picture up to rounding: the samples are the same numbers; a ray at an edge may fall the other way."""
     settings = ir.RenderSettings(width=64, height=64, iterations=2, light_paths=128, estimator=estimator)
-    cpu = ir.render(room(), settings).radiance()
-    gpu = ir.render(room(), settings, device="cuda:0").radiance()
+    cpu = ir.render(box_with_lights(), settings).radiance()
+    gpu = ir.render(box_with_lights(), settings, device="cuda:0").radiance()
     different = np.abs(cpu - gpu).max(axis=2) > 2e-3 * cpu.mean()
     if estimator != "vpl":  # which weighs its VPLs in another order there, and so chooses others
         assert different.mean() <= 0.05

@@ -91,6 +91,7 @@ def test_values_that_are_not_finite_stay_out(device):
     np.testing.assert_array_equal(image[7:], 1.0)
 
 
+@pytest.mark.extended
 def test_long_renders_do_not_drift(device):
     """The mean of ten thousand iterations is as good as float32 can say it, and the deviation as needs be.
 

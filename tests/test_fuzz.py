@@ -9,8 +9,7 @@ import pytest
 from pxr import Tf, UsdUtils
 
 import warp_ir as ir
-
-from . import fuzz
+from tests import fuzz
 
 ROOT = Path(__file__).resolve().parents[1]
 BATCH = 200

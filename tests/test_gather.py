@@ -10,6 +10,8 @@ from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed,
 from warp_ir.procedural import floor, quad
 from warp_ir.scene import LightKind, Material
 
+pytestmark = pytest.mark.extended
+
 
 def half_hidden(others):
     """The floor below a lamp of which half is hidden; `others` times as much light is below the floor."""

@@ -96,6 +96,7 @@ def test_bounds_and_areas_of_many_copies(uneven):
     np.testing.assert_allclose(areas_of_copies(points, triangles, matrices), exact, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_picture_of_instances_is_that_of_copies(device):
     """Mesh ids, albedo, depth and normals are the same, except for single rays at edges, by rounding."""
     settings = ir.RenderSettings(width=96, height=96, iterations=2, estimator="path")
@@ -107,6 +108,7 @@ def test_a_picture_of_instances_is_that_of_copies(device):
         assert close[same].mean() > 0.999, name
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_light_among_instances_is_that_among_copies(estimator, device):
     """The two pictures have the same mean within their standard errors."""
@@ -167,6 +169,7 @@ def _trace(
     visibility[i] += wp.where(visible(scene, q, wp.vec4(p[0], p[1], p[2], 1.0)), 1, 0)
 
 
+@pytest.mark.extended
 def test_cut_outs_and_textures_of_instances_are_those_of_copies(launcher):
     """Camera and shadow rays pass the same holes and read the same texels, except for single rays at edges."""
     n, results = 20_000, []
@@ -183,6 +186,7 @@ def test_cut_outs_and_textures_of_instances_are_those_of_copies(launcher):
     assert 0.1 < (albedos.std(axis=1) > 0.01).mean() < 0.9  # rays hit both the balls and the room
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device):
     """AOVs are the same, and so is the light that falls through the holes."""
@@ -197,6 +201,7 @@ def test_a_picture_of_cut_outs_in_instances_is_that_of_copies(estimator, device)
     assert_mean(one, float(other.radiance().mean()), bias=0.01)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_white_instances_vanish_in_white_light(estimator, device):
     """Surfaces of albedo 1 under a dome of radiance 1 have radiance 1, of any shape at any position (furnace)."""
@@ -216,6 +221,7 @@ def test_white_instances_vanish_in_white_light(estimator, device):
     assert abs(seen.mean() - 1.0) < 5.0 * error + 1e-3  # paths end by roulette at 0.999
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "keller", "path"])
 def test_a_furnace_of_instances(estimator, device):
     """A closed room of emissive tiles reaches Le / (1 - ρ): instances that emit are flattened."""
@@ -266,6 +272,7 @@ def _reflect_around(first: int, scene: SceneData, escapes: wp.array[wp.int32], b
         direction = square_to_cosine_hemisphere(u, hit.normal)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 10.0), (1e6, 1e11)])
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.parametrize("turned", [False, True])

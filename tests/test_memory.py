@@ -10,7 +10,7 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import placed
-from tests.physics.test_light_control import DOWN, everything, lamp_profile
+from tests.physics.scenes import DOWN, everything, lamp_profile
 from warp_ir.cli import main
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_scenes
@@ -109,6 +109,7 @@ SCENES = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_the_estimate_is_good_to_a_fifth(scene):
     """The estimate equals the bytes of all arrays of the uploaded scene within 20 %."""
@@ -129,6 +130,7 @@ def through_a_lens():
     return replace(scene, camera=replace(scene.camera, lens_radius=0.1, focus_distance=1.0))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "scene",
     [cornell_box(), lamps(), normal_mapped(), through_a_lens(), moving()],

@@ -265,6 +265,7 @@ def coverage(n, shift, half):
     return (np.abs(x - shift * times) < half).mean(axis=1).reshape(n, 16).mean(axis=1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("what", ["transform", "points", "camera"])
 def test_coverage_of_a_moving_quad(tmp_path, what, device):
     """A quad that moves while the shutter is open covers a pixel for a share of the time: a trapezium.
@@ -300,6 +301,7 @@ def test_coverage_of_a_moving_quad(tmp_path, what, device):
     np.testing.assert_allclose(sharp, coverage(n, 0.0, half), atol=4 * noise)
 
 
+@pytest.mark.extended
 def test_a_varying_light_gives_its_mean(tmp_path):
     """A lamp whose intensity rises from 0 to 2 while the shutter is open illuminates like one of intensity 1."""
     lamp = """def SphereLight "L" {
@@ -352,6 +354,7 @@ def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.extended
 def test_blur_is_not_filtered_away():
     """With and without the filter a blurred picture has the same mean."""
     scene = ir.load_usd(TURNTABLE, time=5.0)

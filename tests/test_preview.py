@@ -36,6 +36,7 @@ def test_colors_of_nothing():
     assert dot_colors(np.zeros((2, 3))).tolist() == [[0, 0, 0], [0, 0, 0]]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("projection", list(Projection))
 def test_vpl_is_where_the_camera_sees_it(tmp_path, projection):
     """A green VPL at 3/4 of the width and 1/4 of the height is green pixels there, off-centre window and all."""
@@ -49,6 +50,7 @@ def test_vpl_is_where_the_camera_sees_it(tmp_path, projection):
     np.testing.assert_allclose(green.mean(axis=0), [19.5, 59.5], atol=1.0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("view", ["outside", "camera"])
 def test_one_sees_into_a_room(tmp_path, view):
     """VPLs inside the closed Cornell box are seen from outside as from its camera."""
@@ -58,6 +60,7 @@ def test_one_sees_into_a_room(tmp_path, view):
     assert ((pixels[..., 1] > 0.9) & (pixels[..., 0] < 0.2)).any()
 
 
+@pytest.mark.extended
 def test_empty_scene_and_directional_vpls(tmp_path):
     """Nothing at all is a picture, and so is light that comes from nowhere in particular."""
     picture_vpls(Scene(), cloud(np.zeros((0, 3)), np.zeros((0, 3))), tmp_path / "a.png", width=32)

@@ -9,6 +9,8 @@ from scipy.stats import qmc
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere, square_to_disk
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

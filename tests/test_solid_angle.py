@@ -11,6 +11,8 @@ from tests.physics.closed_form import unit_shape
 from warp_ir.sampling.solid_angle import sample_solid_angle, solid_angle_pdf
 from warp_ir.scene import LightKind
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 SIDE = 128

@@ -11,6 +11,8 @@ from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
 from warp_ir.surface import closest, visible
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

@@ -8,6 +8,8 @@ from warp_ir.image.mipmap import mip_chain, resized
 from warp_ir.scene import Texture, Wrap
 from warp_ir.texture import TextureTable, lookup, mean_on_triangles, mip_level, upload_textures, uv_to_st
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

@@ -1,22 +1,12 @@
 """Cameras: which one, what it sees, and the one that frames the scene."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warp_ir import InputError, Projection, Scene, load_usd
-
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
+from tests.stages import load, warned
+from warp_ir import InputError, Projection
 
 
 def camera_text(more: str = "", name: str = "C") -> str:

@@ -1,22 +1,13 @@
 """Black pictures say why, and no other picture does."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from tests.stages import SCENES, load, need_real_files
 from warp_ir import InputError, Scene, load_usd
 from warp_ir.cli import main
 
-ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
-OURS = Path(__file__).parents[1] / "scenes_usd"
 WORDS = ("the camera is inside", "all geometry", "it emits nothing", "sees no geometry")
-
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
 
 
 def said(scene: Scene) -> list[str]:
@@ -117,7 +108,7 @@ def test_a_picture_without_geometry_says_so(tmp_path, capsys):
     assert "sees no geometry" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("path", sorted(OURS.glob("*.usda")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.usda")), ids=lambda p: p.stem)
 def test_no_false_alarms(path):
     """None of the project's scenes is black."""
     assert said(load_usd(path)) == []
@@ -126,7 +117,7 @@ def test_no_false_alarms(path):
 @pytest.mark.slow
 def test_no_false_alarms_on_real_files():
     """Of the real files those only say something that are known to show nothing."""
-    for path in sorted(p for p in ASSETS.rglob("*") if p.suffix in (".usd", ".usda", ".usdc", ".usdz")):
+    for path in need_real_files():
         try:
             scene = load_usd(path)
         except InputError:

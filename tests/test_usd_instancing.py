@@ -8,26 +8,10 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
+from tests.stages import TRIANGLE, load, warned
 from warp_ir import InputError, Scene, load_usd
 from warp_ir.image.io import write_image
 from warp_ir.usd.load import StageReader
-
-TRIANGLE = """
-        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
-        int[] faceVertexCounts = [3]
-        int[] faceVertexIndices = [0, 1, 2]
-        uniform token subdivisionScheme = "none"
-"""
-
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
 
 
 def corners(scene: Scene) -> np.ndarray:

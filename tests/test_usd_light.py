@@ -1,22 +1,16 @@
 """UsdLux radiometry against its closed forms."""
 
+import functools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warp_ir import LightKind, Scene, StageReader, load_usd
+from tests import stages
+from tests.stages import photometry, sky_directions, warned, write_image
+from warp_ir import LightKind, StageReader
 
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, default_light="none", **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
+load = functools.partial(stages.load, default_light="none")
 
 
 def light_text(kind: str, more: str = "", head: str = "") -> str:
@@ -294,13 +288,6 @@ def test_shaping_without_effect_is_none(tmp_path, kind, more):
     assert scene.lights[0].shaping is None and not warned(scene, "/L")
 
 
-def photometry(vertical, horizontal, rows, *, head="TILT=NONE", kind=1, factor=1.0):
-    """An .ies file."""
-    numbers = "\n".join(" ".join(map(str, r)) for r in (vertical, horizontal, *rows))
-    counts = f"1 1000 {factor} {len(vertical)} {len(horizontal)} {kind} 2 0 0 0\n1.0 1.0 100"
-    return f"IESNA:LM-63-2002\n[TEST] x\n{head}\n{counts}\n{numbers}\n"
-
-
 IES = "asset inputs:shaping:ies:file = @./lamp.ies@\n    float inputs:shaping:cone:angle = 180\n    "
 
 
@@ -415,29 +402,11 @@ def test_bad_photometry_is_named(tmp_path, content):
     assert scene.lights[0].shaping is None and warned(scene, "/L", "lamp.ies")
 
 
-def write_png(path, pixels):
-    import OpenImageIO as oiio
-
-    out = oiio.ImageOutput.create(str(path))
-    out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8))
-    out.write_image(pixels)
-    out.close()
-
-
-def write_exr(path, pixels):
-    import OpenImageIO as oiio
-
-    out = oiio.ImageOutput.create(str(path))
-    out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT))
-    out.write_image(pixels)
-    out.close()
-
-
 def test_textures_are_read(tmp_path):
     """The file's linear values multiply the radiance; row 0 is the top of the image; 8 bits are sRGB."""
     pixels = np.arange(24, dtype=np.float32).reshape(2, 4, 3) - 3.0
-    write_exr(tmp_path / "t.exr", pixels)
-    write_png(tmp_path / "t.png", np.full((1, 1, 3), 188, np.uint8))
+    write_image(tmp_path / "t.exr", pixels)
+    write_image(tmp_path / "t.png", np.full((1, 1, 3), 188, np.uint8))
     for kind in ("RectLight", "DomeLight", "DomeLight_1"):
         light = load(tmp_path, light_text(kind, "asset inputs:texture:file = @./t.exr@")).lights[0]
         np.testing.assert_array_equal(light.texture, np.maximum(pixels, 0.0))
@@ -457,7 +426,7 @@ def test_textures_are_read(tmp_path):
 )
 def test_the_pole_of_a_dome(tmp_path, kind, axis, pole, up):
     """A DomeLight's pole is +Y in any stage; a DomeLight_1's is the stage's up axis unless poleAxis says otherwise."""
-    write_exr(tmp_path / "t.exr", np.ones((2, 4, 3), np.float32))
+    write_image(tmp_path / "t.exr", np.ones((2, 4, 3), np.float32))
     more = "asset inputs:texture:file = @./t.exr@\n" + (f'uniform token poleAxis = "{pole}"' if pole else "")
     scene = load(tmp_path, light_text(kind, more).join([f'(upAxis = "{axis}")\n', ""]))
     matrix = scene.lights[0].world_from_light
@@ -467,26 +436,6 @@ def test_the_pole_of_a_dome(tmp_path, kind, axis, pole, up):
         np.testing.assert_allclose(matrix[:3, 2], (0, -1, 0), atol=1e-12)
 
 
-def directions(layout, size):
-    """The directions that the pixels of an image show, from the layouts' definitions: [h, w, 3], NaN where none."""
-    if layout == "cubeMapVerticalCross":
-        out = np.full((4 * size, 3 * size, 3), np.nan)
-        a = (np.arange(size) + 0.5) / size * 2.0 - 1.0
-        x, y = np.meshgrid(a, -a)
-        one = np.ones_like(x)
-        faces = {(0, 1): (x, one, -y), (1, 0): (-one, y, x), (1, 1): (x, y, one), (1, 2): (one, y, -x),
-                 (2, 1): (x, -one, y), (3, 1): (x, -y, -one)}  # fmt: skip
-        for (row, column), face in faces.items():
-            out[row * size : (row + 1) * size, column * size : (column + 1) * size] = np.stack(face, axis=-1)
-        return out / np.linalg.norm(out, axis=-1, keepdims=True)
-    a = (np.arange(size) + 0.5) / size * 2.0 - 1.0
-    x, y = np.meshgrid(a, -a)
-    r = np.hypot(x, y)
-    theta = np.pi * r if layout == "angular" else 2.0 * np.arcsin(np.minimum(r, 1.0))
-    out = np.stack([x / r * np.sin(theta), y / r * np.sin(theta), np.cos(theta)], axis=-1)
-    return np.where(r[..., None] <= 1.0, out, np.nan)
-
-
 @pytest.mark.parametrize("layout", ["angular", "mirroredBall", "cubeMapVerticalCross"])
 def test_layouts_of_domes(tmp_path, layout):
     """A sky of L = 2 + d · (0.5, 1, 0.2) in any layout becomes the lat-long sky of the same radiance.
@@ -494,9 +443,9 @@ def test_layouts_of_domes(tmp_path, layout):
     Half a pixel of 200 or so is 0.016 rad at most; the back of a mirrored ball, compressed into its rim, is left out.
     """
     slope = np.array([0.5, 1.0, 0.2])
-    d = directions(layout, 100 if layout == "cubeMapVerticalCross" else 256)
+    d = sky_directions(layout, 100 if layout == "cubeMapVerticalCross" else 256)
     sky = np.nan_to_num(2.0 + d @ slope, nan=7.0)
-    write_exr(tmp_path / "t.exr", np.repeat(sky[:, :, None], 3, axis=2).astype(np.float32))
+    write_image(tmp_path / "t.exr", np.repeat(sky[:, :, None], 3, axis=2).astype(np.float32))
     more = f'asset inputs:texture:file = @./t.exr@\ntoken inputs:texture:format = "{layout}"'
     scene = load(tmp_path, light_text("DomeLight", more))
     assert not warned(scene, "/L")
@@ -511,7 +460,7 @@ def test_layouts_of_domes(tmp_path, layout):
 
 def test_a_cross_of_another_shape_is_named(tmp_path):
     """An image that is not 3 x 4 faces is no vertical cross."""
-    write_exr(tmp_path / "t.exr", np.ones((8, 8, 3), np.float32))
+    write_image(tmp_path / "t.exr", np.ones((8, 8, 3), np.float32))
     more = 'asset inputs:texture:file = @./t.exr@\ntoken inputs:texture:format = "cubeMapVerticalCross"'
     assert warned(load(tmp_path, light_text("DomeLight", more)), "/L", "no vertical cross")
 
@@ -740,7 +689,7 @@ def test_textures_of_mesh_lights(tmp_path):
     """texture:file multiplies the emission and is placed by the mesh's st."""
     pixels = np.zeros((2, 2, 3), np.float32)
     pixels[0, 1] = (1.0, 0.5, 0.25)
-    write_exr(tmp_path / "t.exr", pixels)
+    write_image(tmp_path / "t.exr", pixels)
     more = """asset inputs:texture:file = @t.exr@
     texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")"""
     scene = load(tmp_path, MESH_LIGHT % ("MeshLightAPI", more))

@@ -5,47 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_ir import Material, Scene, load_usd
+from tests.stages import QUADS, diffuse, load, material_text, only_material, warned
+from warp_ir import Material
 
-QUADS = """
-    point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)]
-    int[] faceVertexCounts = [4, 4]
-    int[] faceVertexIndices = [0, 1, 2, 3, 1, 4, 5, 2]
-    uniform token subdivisionScheme = "none"
-"""
 BOUND = 'def Mesh "M" (prepend apiSchemas = ["MaterialBindingAPI"]) {' + QUADS + "rel material:binding = </A>\n}\n"
-
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
-
-
-def material_text(inputs: str = "", name: str = "A", shader: str = "UsdPreviewSurface", output: str = "surface") -> str:
-    return f"""
-def Material "{name}" {{
-    token outputs:{output}.connect = </{name}/S.outputs:surface>
-    def Shader "S" {{
-        uniform token info:id = "{shader}"
-        {inputs}
-        token outputs:surface
-    }}
-}}
-"""
-
-
-def diffuse(color: str, name: str = "A") -> str:
-    return material_text(f"color3f inputs:diffuseColor = {color}", name)
-
-
-def only_material(scene: Scene) -> Material:
-    (material,) = scene.materials
-    return material
 
 
 def test_without_material_or_colour_a_surface_is_grey(tmp_path):

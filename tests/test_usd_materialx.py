@@ -1,22 +1,19 @@
 """MaterialX documents that stages refer to: what a reader with OpenUSD's plug-in would see."""
 
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pxr import Sdf
 
 import warp_ir as ir
-from tests.test_usd_look import ST
-from tests.test_usd_material import QUADS, load, only_material, warned
-from tests.test_usd_texture import write
+from tests import stages
+from tests.stages import QUADS, load, only_material, real_file, warned, write_image
 from warp_ir.usd.stage import materialx, mtlx_layers
 from warp_ir.usd.values.source_color_space import srgb_to_linear
 
 pytest.importorskip("MaterialX")
 
-ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
 DOCUMENT = """<?xml version="1.0"?>
 <materialx version="1.38" colorspace="lin_rec709">
   <nodegraph name="G">
@@ -50,8 +47,7 @@ ROOT = 'def "MaterialX" (references = @./looks.mtlx@</MaterialX>) {\n}\n'
 
 
 def mesh(binding="/MaterialX/Materials/A", name="M"):
-    text = f'def Mesh "{name}" (prepend apiSchemas = ["MaterialBindingAPI"]) {{{QUADS} {ST}\n'
-    return f"{text} rel material:binding = <{binding}>\n}}\n"
+    return stages.mesh(name=name, material=binding)
 
 
 @pytest.fixture
@@ -71,7 +67,7 @@ def test_a_referenced_document(looks):
 def test_graphs_images_and_interfaces(looks):
     """An image beside the document, tinted by an input of its graph."""
     pixels = np.uint8([[[10, 200, 90], [255, 0, 127]]])
-    write(looks / "a.png", pixels)
+    write_image(looks / "a.png", pixels)
     scene = load(looks, ROOT + mesh("/MaterialX/Materials/Picture"))
     expected = srgb_to_linear(pixels / 255.0) * (0.5, 0.5, 0.25)
     np.testing.assert_allclose(only_material(scene).albedo_texture.pixels, expected, atol=2.0**-11)
@@ -178,7 +174,7 @@ def test_what_others_share_is_left_alone(looks):
 def test_textures_of_the_copied_layers(looks):
     """A layer that refers to a document also names images: they are found beside it as before, tiles too."""
     for tile in (1001, 1002):
-        write(looks / f"t.{tile}.png", np.full((1, 1, 3), 255, np.uint8))
+        write_image(looks / f"t.{tile}.png", np.full((1, 1, 3), 255, np.uint8))
     text = """
 def Material "T" {
     token outputs:surface.connect = </T/S.outputs:surface>
@@ -253,9 +249,9 @@ def test_many_materials_that_share_a_graph_are_bounded(looks, monkeypatch):
     assert warned(load(looks, ROOT + mesh()), "more than 5 nodes")
 
 
-@pytest.mark.skipif(not ASSETS.exists(), reason="needs the collection of assets")
+@pytest.mark.extended
 def test_twins_by_reference_and_inline():
     """A Cornell box whose materials are a document equals the one that holds them itself."""
-    folder = ASSETS / "cornell_pablode" / "cornell-box"
+    folder = real_file("cornell_pablode/cornell-box")
     one, other = (ir.load_usd(folder / kind / "cornell-box.usda") for kind in ("mtlx-ref", "mtlx-usdshade"))
     assert [(m.albedo, m.emission) for m in one.materials] == [(m.albedo, m.emission) for m in other.materials]

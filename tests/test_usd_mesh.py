@@ -2,53 +2,13 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
 
-from warp_ir import Mesh, Scene, load_usd
+from tests.stages import SQUARE, area, area_vectors, load, mesh_text, volume, warned
 
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
-
-
-def mesh_text(points: object, counts: object, indices: object, more: str = "", name: str = "M") -> str:
-    return f"""
-def Mesh "{name}" {{
-    point3f[] points = {[tuple(map(float, p)) for p in points]}
-    int[] faceVertexCounts = {list(counts)}
-    int[] faceVertexIndices = {list(indices)}
-    uniform token subdivisionScheme = "none"
-    {more}
-}}"""
-
-
-def area_vectors(mesh: Mesh) -> np.ndarray:
-    """Area of each triangle along its geometric normal, [m, 3]."""
-    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
-    return 0.5 * np.cross(b - a, c - a)
-
-
-def area(mesh: Mesh) -> float:
-    return float(np.linalg.norm(area_vectors(mesh), axis=1).sum())
-
-
-def volume(mesh: Mesh) -> float:
-    """Of a closed mesh, positive if it is wound outward."""
-    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
-    return float(np.einsum("mi,mi->", a, np.cross(b, c)) / 6.0)
-
-
-SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 L_SHAPE = [(0, 0, 0), (3, 0, 0), (3, 1, 0), (1, 1, 0), (1, 3, 0), (0, 3, 0)]  # area 5
 DART = [(0, 0, 0), (2, 0, 0), (0.5, 0.5, 0), (0, 2, 0)]  # reflex at 2; area 1
 

@@ -5,27 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_ir import InputError, LightKind, Scene, load_usd
-
-ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
-FILES = sorted(p for p in ASSETS.rglob("*") if p.suffix in (".usd", ".usda", ".usdc", ".usdz"))
-
-TRIANGLE = """
-    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
-    int[] faceVertexCounts = [3]
-    int[] faceVertexIndices = [0, 1, 2]
-    uniform token subdivisionScheme = "none"
-"""
-
-
-def load(folder: Path, text: str, **options: object) -> Scene:
-    file = folder / "stage.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return load_usd(file, **options)
-
-
-def warned(scene: Scene, *words: str) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
+from tests.stages import TRIANGLE, load, need_real_files, real_file_parameters, warned
+from warp_ir import InputError, LightKind, load_usd
 
 
 @pytest.mark.parametrize("name", ["missing.usda", ".", "text.usda", "picture.png"])
@@ -262,15 +243,15 @@ def _survives(file: Path) -> None:
     assert all("\n" not in line for line in scene.warnings)
 
 
-@pytest.mark.skipif(not FILES, reason="the collection of real files is not here")
+@pytest.mark.extended
 def test_some_real_files_survive():
     """Every 16th file of the collection loads into consistent records, or is refused in one line."""
-    for file in FILES[::16]:
+    for file in need_real_files()[::16]:
         _survives(file)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ASSETS)))
+@pytest.mark.parametrize("file", real_file_parameters())
 def test_every_real_file_survives(file):
     """Any file loads into consistent records, or is refused in one line."""
     _survives(file)

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.test_usd_look import RAW, UNPACK, mesh, textured
-from tests.test_usd_material import load
-from tests.test_usd_texture import write
+from tests.stages import RAW, UNPACK, load, mesh, textured, write_image
 from warp_ir.usd.geometry.tangents import smooth_tangents
 
 FOLD = np.array([(0, 0, 0), (0, 0, -1), (1, 0, 0), (1, 0, -1), (0, 1, 0), (0, 1, -1)], float)
@@ -56,7 +54,7 @@ def test_where_textures_do_not_grow_there_is_no_tangent():
 
 def test_smooth_surfaces_with_normal_maps_have_tangents(tmp_path):
     """Only they: facets have their own, and other materials need none."""
-    write(tmp_path / "a.png", np.uint8([[[200, 128, 220]]]))
+    write_image(tmp_path / "a.png", np.uint8([[[200, 128, 220]]]))
     normals = "normal3f[] normals = [(0, 0, 1), (0.6, 0, 0.8), (0.6, 0, 0.8), (0, 0, 1), (0.6, 0, 0.8), (0, 0, 1)]"
     text = textured(f"{UNPACK}\n {RAW}", target="normal3f inputs:normal")
     st = "texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0), (2, 1)] (interpolation = 'vertex')"

@@ -5,9 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.test_usd_look import RGBA, ST, mesh
-from tests.test_usd_material import load, material_text, only_material, warned
-from tests.test_usd_texture import write
+from tests.stages import RGBA, ST, load, material_text, mesh, only_material, warned, write_image
 from warp_ir.scene import Wrap
 from warp_ir.usd.images.asset import srgb_to_linear
 
@@ -36,7 +34,7 @@ def Material "A" {{
 @pytest.fixture
 def image(tmp_path):
     """a.png, of which the tests know every byte."""
-    write(tmp_path / "a.png", RGBA)
+    write_image(tmp_path / "a.png", RGBA)
     return RGBA / 255.0
 
 
@@ -256,7 +254,7 @@ export material Oak(*)
 def oak(tmp_path):
     """A library with a material and a texture."""
     (tmp_path / "lib").mkdir()
-    write(tmp_path / "lib" / "a.png", RGBA)
+    write_image(tmp_path / "lib" / "a.png", RGBA)
     (tmp_path / "lib" / "Oak.mdl").write_text(MODULE.replace("TEXTURE", ""))
     return tmp_path
 

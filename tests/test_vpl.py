@@ -101,10 +101,10 @@ def test_those_that_find_room_stand_for_all(monkeypatch, noted, device):
     In a furnace all VPLs have one intensity, so the flux as a whole is the same to rounding; a bounce with a share p of
     the VPLs keeps 1000 p of them on the mean, spread by less than √(1000 p (1 - p)); five of them.
     """
-    monkeypatch.setattr("warp_ir.vpl.emission._FOLLOWED_AGAIN", noted)  # many paths are followed again, or few
+    monkeypatch.setattr("warp_ir.vpl.emission._RETRACED_SHARE", noted)  # many paths are followed again, or few
     scene, settings = furnace(0.5, 2.0, shape="cube"), {"light_paths": 8192, "seed": 3}
     every = trace(scene, device, **settings)
-    monkeypatch.setattr("warp_ir.vpl.emission._MOST_ROOM", 1000)
+    monkeypatch.setattr("warp_ir.vpl.emission._MAX_CAPACITY", 1000)
     some = trace(scene, device, **settings)
     assert len(some.bounce) == 8192 + 1000
     np.testing.assert_array_equal(some.positions[:8192], every.positions[:8192])

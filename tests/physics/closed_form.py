@@ -1,7 +1,5 @@
 """Irradiance by quadrature, and the checks that compare a picture with a number."""
 
-import math
-
 import numpy as np
 
 import warp_ir as ir
@@ -80,14 +78,68 @@ def irradiance_at_origin(light: ir.Light, n: int = 600, factor=None) -> float:
     return float(light.radiance[0] * np.sum(towards * cos_floor * cos_light_area / d2))
 
 
-def rotation_x(degrees: float) -> np.ndarray:
+def rotation(axis, degrees):
+    """Right-handed about the axis 0, 1 or 2, as a 3x3 matrix on column vectors."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[j, j], matrix[j, k], matrix[k, j], matrix[k, k] = c, -s, s, c
+    return matrix
+
+
+def rotation_x(degrees):
     """A rotation about X as a 3x3 matrix on column vectors."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    return rotation(0, degrees)
 
 
-def placed(linear: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
-    """A 4x4 matrix."""
+def placed(linear, origin=(0.0, 0.0, 0.0)):
+    """A 4x4 matrix of a linear part and a place."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, origin
     return matrix
+
+
+def bilinear(texels, u, v, *, periodic=False, around=False):
+    """Between centres of texels [h, w] or [h, w, 3]; u runs to the right, v down.
+
+    The image goes on at its edges, repeats (`periodic`), or repeats to the left and right alone (`around`).
+    """
+    h, w = texels.shape[:2]
+    x, y = u * w - 0.5, v * h - 0.5
+    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+    channels = (...,) + (None,) * (texels.ndim - 2)
+    fx, fy = (x - i)[channels], (y - j)[channels]
+
+    def texel(row, column):
+        row = row % h if periodic else np.clip(row, 0, h - 1)
+        return texels[row, column % w if periodic or around else np.clip(column, 0, w - 1)]
+
+    return (texel(j, i) * (1 - fx) + texel(j, i + 1) * fx) * (1 - fy) + (
+        texel(j + 1, i) * (1 - fx) + texel(j + 1, i + 1) * fx
+    ) * fy
+
+
+def shaped(cosine, angle=90.0, softness=0.0, focus=0.0, tint=0.0):
+    """UsdLux: lerp(|cos|^focus, tint, 1) · (1 - smoothstep(θ, angle (1 - softness), angle))."""
+    theta = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    low = angle * (1.0 - softness)
+    t = np.clip((theta - low) / max(angle - low, 1e-9), 0.0, 1.0)
+    return (tint + (1.0 - tint) * np.abs(cosine) ** focus) * (1.0 - t * t * (3.0 - 2.0 * t))
+
+
+def factor(shaping, cosine):
+    """What a grey `Shaping` multiplies the radiance with at an angle to the axis."""
+    return shaped(cosine, shaping.cone_angle, shaping.cone_softness, shaping.focus, shaping.focus_tint[0])
+
+
+def assert_agree(one, two, *, outliers):
+    """Per pixel the difference of two films over its standard error is a standard normal; so is the mean's.
+
+    A share of `outliers` of all values may exceed 4.5. The shift of the mean stays within 4 standard errors, each at
+    most the mean of the first film's, whose pixels may be correlated: VPLs are.
+    """
+    error = np.hypot(one.standard_error(), two.standard_error())
+    z = (one.radiance() - two.radiance()) / np.maximum(error, 1e-12)
+    assert (np.abs(z) > 4.5).mean() <= outliers
+    shift = float(one.radiance().mean() - two.radiance().mean())
+    assert abs(shift) < 4.0 * float(one.standard_error().mean())

@@ -174,53 +174,7 @@ def rectangle(matrix, width=1.0, height=1.0):
     return place
 
 
-def rotation(axis, degrees):
-    """Right-handed about the axis 0, 1 or 2; 3x3, on column vectors."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    j, k = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[j, j], matrix[j, k], matrix[k, j], matrix[k, k] = c, -s, s, c
-    return matrix
-
-
-def placed(linear, origin=(0.0, 0.0, 0.0)):
-    """A 4x4 matrix."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = linear, origin
-    return matrix
-
-
-def bilinear(texels, u, v, *, periodic=False):
-    """Between centres of texels [h, w, 3], which go on at the edges or repeat; u to the right, v down."""
-    h, w = texels.shape[:2]
-    x, y = u * w - 0.5, v * h - 0.5
-    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
-    fx, fy = (x - i)[..., None], (y - j)[..., None]
-
-    def texel(row, column):
-        if periodic:
-            return texels[row % h, column % w]
-        return texels[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-
-    return (texel(j, i) * (1 - fx) + texel(j, i + 1) * fx) * (1 - fy) + (
-        texel(j + 1, i) * (1 - fx) + texel(j + 1, i + 1) * fx
-    ) * fy
-
-
 def srgb(byte):
     """IEC 61966-2-1: the light of a byte."""
     x = np.asarray(byte) / 255.0
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def write_image(path, pixels, kind="float"):
-    """An image [h, w, channels], its row 0 at the top, by OpenImageIO; `kind` is the type of the file's numbers."""
-    import OpenImageIO as oiio
-
-    pixels = np.asarray(pixels)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec["oiio:UnassociatedAlpha"] = 1  # colours are not multiplied by it
-    out = oiio.ImageOutput.create(str(path))
-    assert out.open(str(path), spec), oiio.geterror()
-    assert out.write_image(np.ascontiguousarray(pixels))
-    out.close()

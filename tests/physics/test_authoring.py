@@ -5,7 +5,8 @@ import pytest
 from pxr import Sdf, UsdUtils
 
 import warp_ir as ir
-from tests.physics import closed_form
+from tests.physics import closed_form, level
+from tests.stages import diffuse
 
 # A floor, a wall and a box with a colour on each side, under a rectangle light.
 FLOOR = [(-2, 0, -2), (-2, 0, 2), (2, 0, 2), (2, 0, -2)]
@@ -17,30 +18,11 @@ PLACES = [(-0.9, 0, 0), (0.9, 0, 0.4)]
 TURN = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # Y up to Z up
 
 
-def material(name, color):
-    return f"""
-def Material "{name}" {{
-    token outputs:surface.connect = </{name}/S.outputs:surface>
-    def Shader "S" {{
-        uniform token info:id = "UsdPreviewSurface"
-        color3f inputs:diffuseColor = {color}
-        token outputs:surface
-    }}
-}}"""
-
-
 def mesh(name, points, faces, more="", left=False, api=""):
     if left:
         faces = [face[::-1] for face in faces]
         more += '\n    uniform token orientation = "leftHanded"'
-    return f"""
-def Mesh "{name}" {api} {{
-    point3f[] points = {[tuple(map(float, p)) for p in points]}
-    int[] faceVertexCounts = {[len(face) for face in faces]}
-    int[] faceVertexIndices = {[int(i) for face in faces for i in face]}
-    uniform token subdivisionScheme = "none"
-    {more}
-}}"""
+    return level.mesh(name, points, faces, more, api)
 
 
 def box(name, place, scale, turn, how, left):
@@ -59,7 +41,7 @@ def box(name, place, scale, turn, how, left):
         )
         return mesh(name, points, SIDES, parts, left)
     if how == "meshes":
-        bound = '(prepend apiSchemas = ["MaterialBindingAPI"])'
+        bound = '"MaterialBindingAPI"'
         return f'\ndef Xform "{name}" {{' + "".join(
             mesh(f"S{k}", points, [side], f"rel material:binding = </L{k}>", left, bound)
             for k, side in enumerate(SIDES)
@@ -80,7 +62,7 @@ def stage(how="uniform", *, scale=1.0, up="Y", left=False, instanced=False):
     turn = TURN if up == "Z" else np.eye(3)
     grey = "color3f[] primvars:displayColor = [(0.6, 0.6, 0.6)]"
     text = f'(\n upAxis = "{up}"\n metersPerUnit = {1.0 / scale}\n)\n'
-    text += "".join(material(f"L{k}", color) for k, color in enumerate(SIDE_COLORS))
+    text += "".join(diffuse(str(color), f"L{k}") for k, color in enumerate(SIDE_COLORS))
     for name, points in (("Floor", FLOOR), ("Wall", WALL)):
         text += mesh(name, np.array(points) @ turn.T * scale, [[0, 1, 2, 3]], grey, left)
     if instanced:

@@ -9,19 +9,10 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.level import (
-    assert_level,
-    at,
-    check,
-    irradiance,
-    light,
-    load,
-    material,
-    mesh,
-    placed,
-    rectangle,
-    rotation,
-)
+from tests.physics.closed_form import placed, rotation
+from tests.physics.level import assert_level, at, check, irradiance, light, load, material, mesh, rectangle
+
+pytestmark = pytest.mark.extended
 
 GLOW = material("color3f inputs:diffuseColor = (0, 0, 0)\n        color3f inputs:emissiveColor = (2, 2, 2)", "Glow")
 BOUND = "rel material:binding = </Glow>"

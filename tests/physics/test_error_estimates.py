@@ -14,6 +14,8 @@ from warp_ir.metrics import relative_mse, z_scores
 from warp_ir.procedural import cube, furnace, mesh, quad, sphere
 from warp_ir.scene import LightKind, Projection, Shaping
 
+pytestmark = pytest.mark.extended
+
 SIZE = 32
 SHARES = 2.0 ** np.random.default_rng(0).uniform(-9.0, -1.0, (SIZE, SIZE))
 DIM, BRIGHT = 1.0, 300.0

@@ -18,13 +18,16 @@ def truncation(albedo, paths=PATHS):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
-@pytest.mark.parametrize("albedo", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize(
+    "albedo", [pytest.param(0.2, marks=pytest.mark.extended), 0.5, pytest.param(0.8, marks=pytest.mark.extended)]
+)
 def test_radiance_is_emission_over_absorption(estimator, shape, albedo, device):
     """A closed room of emission Le and albedo ρ has radiance Le / (1 - ρ) everywhere."""
     film = render(furnace(albedo, 1.0, shape=shape, level=3), estimator, device)
     assert_mean(film, 1.0 / (1.0 - albedo), bias=truncation(albedo) if estimator == "keller" else 0.0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("absorption", ["fractional", "roulette"])
 @pytest.mark.parametrize("bounces", [0, 1, 3])
@@ -36,6 +39,7 @@ def test_max_bounces_cuts_the_series(estimator, absorption, bounces, device):
     assert_mean(film, sum(0.5**k for k in range(bounces + 2)))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_terms_of_the_series_are_split_into_direct_and_indirect(estimator, device):
     """In the furnace Le = 1, ρ = 1/2: emission and one reflection are 3/2, all the rest 1/2."""
@@ -46,6 +50,7 @@ def test_terms_of_the_series_are_split_into_direct_and_indirect(estimator, devic
     np.testing.assert_allclose(film.aov("direct") + film.aov("indirect"), film.radiance(), rtol=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("share", [0.1, 0.25])
 def test_bound_loses_a_known_part(share, device):
     """In a sphere of radius R, where G = 1/(4R²) for any two points, G ≤ c/(4R²) leaves Le + c (Le/(1-ρ) - Le).

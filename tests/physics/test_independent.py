@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.level import at, image_nodes, load, material, mesh, placed, rotation, usd, write_image
+from tests.physics.closed_form import placed, rotation
+from tests.physics.level import at, image_nodes, load, material, mesh, usd
+from tests.stages import write_image
 
 pytestmark = pytest.mark.slow
 

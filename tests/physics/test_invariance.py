@@ -7,6 +7,7 @@ import pytest
 
 import warp_ir as ir
 from tests.physics import closed_form
+from tests.physics.scenes import box_with_lights
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, mesh
 from warp_ir.renderer import Renderer
@@ -20,18 +21,6 @@ def render(scene, estimator, device="cpu", **settings):
     return closed_form.render(
         scene, estimator, device, **(dict(width=24, height=24, iterations=2, light_paths=64, filter=True) | settings)
     )
-
-
-def room():
-    """A Cornell box with an analytic light of each kind beside its emissive surface."""
-    scene = cornell_box()
-    lights = []
-    for k, kind in enumerate(LightKind):
-        matrix = np.eye(4)
-        matrix[:3, 3] = (100.0 + 50.0 * k, 400.0, 250.0)
-        strength = 1.0e4 if kind == LightKind.POINT else 0.3
-        lights.append(ir.Light(kind.name, kind, (strength,) * 3, matrix, 40.0, 30.0, 15.0, 40.0, 30.0))
-    return dataclasses.replace(scene, lights=tuple(lights))
 
 
 def transformed(scene, linear, shift):
@@ -59,7 +48,7 @@ def transformed(scene, linear, shift):
 
 def test_twice_the_light_is_twice_the_film(estimator, device):
     """Doubling every emission doubles every pixel, bit for bit."""
-    scene = room()
+    scene = box_with_lights()
     brighter = dataclasses.replace(
         scene,
         materials=tuple(dataclasses.replace(m, emission=tuple(2 * e for e in m.emission)) for m in scene.materials),
@@ -72,7 +61,7 @@ def test_twice_the_light_is_twice_the_film(estimator, device):
 
 def test_exposure_scales_the_film(estimator, device):
     """A camera exposure of 4 gives four times the film, bit for bit."""
-    scene = room()
+    scene = box_with_lights()
     brighter = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, exposure=4.0))
     np.testing.assert_array_equal(
         render(brighter, estimator, device).radiance(), 4.0 * render(scene, estimator, device).radiance()
@@ -82,9 +71,9 @@ def test_exposure_scales_the_film(estimator, device):
 @pytest.mark.parametrize("exponent", [-20, -3, 1, 20])
 def test_powers_of_two_of_scale_change_nothing(estimator, exponent, device):
     """A scene 2^k times as large is the same picture, bit for bit."""
-    scaled = transformed(room(), np.eye(3) * 2.0**exponent, np.zeros(3))
+    scaled = transformed(box_with_lights(), np.eye(3) * 2.0**exponent, np.zeros(3))
     np.testing.assert_array_equal(
-        render(scaled, estimator, device).radiance(), render(room(), estimator, device).radiance()
+        render(scaled, estimator, device).radiance(), render(box_with_lights(), estimator, device).radiance()
     )
 
 
@@ -95,10 +84,10 @@ def test_scale_and_position_change_only_rounding(estimator, scale, shift, device
     Rounding can decide a ray at an edge the other way: allow that for 1 % of the pixels. In `vpl` one VPL more or
     less shifts what all pixels choose, and so a part of the noise: it may differ by half of what a seed changes.
     """
-    moved = transformed(room(), np.eye(3) * scale, np.full(3, shift))
-    here, there = render(room(), estimator, device).radiance(), render(moved, estimator, device).radiance()
+    moved = transformed(box_with_lights(), np.eye(3) * scale, np.full(3, shift))
+    here, there = render(box_with_lights(), estimator, device).radiance(), render(moved, estimator, device).radiance()
     if estimator == "vpl":
-        reseeded = render(room(), estimator, device, seed=1).radiance()
+        reseeded = render(box_with_lights(), estimator, device, seed=1).radiance()
         assert np.abs(here - there).mean() <= 0.5 * np.abs(here - reseeded).mean()
         return
     different = np.abs(here - there).max(axis=2) > 2e-3 * here.mean()
@@ -138,7 +127,7 @@ def test_rotation_changes_only_the_noise(estimator, device):
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     films = [
         closed_form.render(scene, estimator, device, width=12, height=12)
-        for scene in (room(), transformed(room(), turn, np.array([5.0, -3.0, 100.0])))
+        for scene in (box_with_lights(), transformed(box_with_lights(), turn, np.array([5.0, -3.0, 100.0])))
     ]
     means = [float(f.radiance().mean()) for f in films]
     slack = 4.0 * np.hypot(*(float(f.standard_error().mean()) for f in films))
@@ -150,7 +139,7 @@ def test_threads_change_nothing(estimator):
     images = []
     for threads in (1, 2, 5):
         settings = ir.RenderSettings(width=24, height=24, estimator=estimator, light_paths=64)
-        renderer = Renderer(room(), settings, threads=threads)
+        renderer = Renderer(box_with_lights(), settings, threads=threads)
         film = renderer.new_film()
         renderer.add_iteration(film, 0)
         images.append(film.radiance())
@@ -160,6 +149,6 @@ def test_threads_change_nothing(estimator):
 
 def test_seeds(estimator, device):
     """The same seed gives the same bits, another one another picture."""
-    first, again = render(room(), estimator, device), render(room(), estimator, device)
+    first, again = render(box_with_lights(), estimator, device), render(box_with_lights(), estimator, device)
     np.testing.assert_array_equal(first.radiance(), again.radiance())
-    assert not np.array_equal(first.radiance(), render(room(), estimator, device, seed=1).radiance())
+    assert not np.array_equal(first.radiance(), render(box_with_lights(), estimator, device, seed=1).radiance())

@@ -9,11 +9,11 @@ import math
 import numpy as np
 import pytest
 
+from tests.physics.closed_form import bilinear, placed, rotation, shaped
 from tests.physics.level import (
     EYE,
     assert_level,
     at,
-    bilinear,
     check,
     floor,
     irradiance,
@@ -22,13 +22,13 @@ from tests.physics.level import (
     load,
     material,
     panel,
-    placed,
     rectangle,
-    rotation,
     srgb,
     usd,
-    write_image,
-)  # fmt: skip
+)
+from tests.stages import write_image
+
+pytestmark = pytest.mark.extended
 
 DOWN = rotation(0, -90.0)
 TILTED = rotation(1, 20.0) @ rotation(0, -70.0)
@@ -38,14 +38,6 @@ AXIS = -TILTED[:, 2]
 """Where it points."""
 AREA = 1.6 * 0.7
 """Of a unit square there."""
-
-
-def shaped(cosine, angle=90.0, softness=0.0, focus=0.0, tint=0.0):
-    """UsdLux: lerp(|cos|^focus, tint, 1) · (1 - smoothstep(θ, angle (1 - softness), angle))."""
-    theta = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    low = angle * (1.0 - softness)
-    t = np.clip((theta - low) / max(angle - low, 1e-9), 0.0, 1.0)
-    return (tint + (1.0 - tint) * np.abs(cosine) ** focus) * (1.0 - t * t * (3.0 - 2.0 * t))
 
 
 SHAPINGS = {

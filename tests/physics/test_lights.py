@@ -7,17 +7,15 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
+from tests.physics.scenes import DOWN, over_floor
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import floor
 from warp_ir.scene import LightKind
 
-DOWN = rotation_x(-90.0)  # takes the light's -Z to the world's -Y
+pytestmark = pytest.mark.extended
+
 STRETCH = np.diag([2.0, 1.0, 0.5])
 SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
-
-
-def over_floor(light, estimator, device):
-    return render(floor(light), estimator, device, max_bounces=0, light_paths=1024)
 
 
 def light(kind, linear, **dimensions):

@@ -9,22 +9,11 @@ import math
 import numpy as np
 import pytest
 
-from tests.physics.level import (
-    EYE,
-    assert_level,
-    bilinear,
-    floor,
-    image_nodes,
-    irradiance,
-    level,
-    light,
-    load,
-    mesh,
-    placed,
-    rotation,
-    srgb,
-    write_image,
-)
+from tests.physics.closed_form import bilinear, placed, rotation
+from tests.physics.level import EYE, assert_level, floor, image_nodes, irradiance, level, light, load, mesh, srgb
+from tests.stages import write_image
+
+pytestmark = pytest.mark.extended
 
 SUN = light(
     "DistantLight", f"float inputs:angle = 0\n    float inputs:intensity = {math.pi}", placed(rotation(0, -90.0))

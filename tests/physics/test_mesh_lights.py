@@ -7,47 +7,33 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
-from tests.physics.test_light_control import (
+from tests.physics.closed_form import (
+    assert_mean,
+    factor,
+    irradiance_at_origin,
+    placed,
+    render,
+    rotation_x,
+)
+from tests.physics.scenes import (
+    BLACK_GLOW,
     DOWN,
     LAMP,
     SHAPINGS,
     TILTED,
     ball_over_floor,
-    factor,
     lamp_profile,
+    panel,
     pixels,
-    sky_texture,
+    with_panel,
 )
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_scene
 from warp_ir.estimators import ESTIMATORS
-from warp_ir.procedural import cube, floor, mesh, quad, sphere
+from warp_ir.procedural import cube, floor, mesh, sphere
 from warp_ir.scene import LightKind, Shaping
 
-BLACK_GLOW = ir.Material("glow", (0.0,) * 3, (3.0,) * 3)
-
-
-def panel(light, k=0, *, double_sided=False, **control):
-    """The rectangle of a RECT light as two triangles of material k, with the light's controls."""
-    x, y = 0.5 * light.width, 0.5 * light.height
-    corners = np.array([(-x, -y, 0), (-x, y, 0), (x, y, 0), (x, -y, 0)])  # counter-clockwise seen from -Z
-    points = corners @ light.world_from_light[:3, :3].T + light.world_from_light[:3, 3]
-    own = dict(shaping=light.shaping, shadows=light.shadows, unlit=light.unlit, shadowless=light.shadowless)
-    out = quad(light.name, points)
-    return dataclasses.replace(
-        out,
-        material=np.full(2, k, np.int32),
-        double_sided=double_sided,
-        light=ir.MeshLight(light.name, light.world_from_light, **(own | control)),
-    )
-
-
-def with_panel(scene, *lights, material=BLACK_GLOW):
-    """The scene without its lights, and with panels in their places as its last meshes."""
-    panels = tuple(panel(light, len(scene.materials)) for light in lights)
-    materials = (*scene.materials, material)
-    return dataclasses.replace(scene, meshes=(*scene.meshes, *panels), materials=materials, lights=())
+pytestmark = pytest.mark.extended
 
 
 def over_floor(light, estimator, device, **settings):
@@ -230,59 +216,6 @@ def test_panels_close_by(shadows, estimator):
     x = (0.5 / height) / math.hypot(1.0, 0.5 / height)
     film = render(scene, estimator, max_bounces=0, light_paths=1024)
     assert_mean(film, 3.0 * 4.0 / math.pi * x * math.atan(x), bias=1.0e-3)
-
-
-def glowing_room():
-    """A room that only surfaces light, with all that can be asked of them; one of them stands in a corner."""
-    points, triangles = sphere(0.5, level=2)
-    ball = mesh("ball", points + np.array([0.7, -1.0, 0.3]), triangles)
-    shade = quad("shade", [(-1.2, 0.9, -0.6), (-0.2, 0.9, -0.6), (-0.2, 0.9, 0.4), (-1.2, 0.9, 0.4)])
-    points, triangles = cube(4.0, inward=True)
-    walls = mesh("walls", points, triangles)
-    spot = Shaping(cone_angle=50.0, cone_softness=0.5, focus=1.0, focus_tint=(0.5, 0.1, 0.0))
-    lamps = [
-        (ir.Light("a", LightKind.RECT, (1.0,) * 3, placed(DOWN, (-0.7, 1.5, 0.0)), width=0.8, height=0.5,
-                  shadowless=frozenset({2})), {}),
-        (ir.Light("c", LightKind.RECT, (1.0,) * 3, placed(rotation_x(20.0), (0.0, 0.0, 1.5)), width=0.4, height=0.3,
-                  shaping=Shaping(cone_angle=25.0), unlit=frozenset({1})), {}),
-        (ir.Light("e", LightKind.RECT, (1.0,) * 3, placed(rotation_x(-120.0), (1.9, -1.3, -1.2)), width=0.6, height=0.3,
-                  shadows=False), dict(double_sided=True)),
-    ]  # fmt: skip
-    panels = [panel(light, 1 + k, **how) for k, (light, how) in enumerate(lamps)]
-    points, triangles = sphere(0.15, level=2)
-    bulb = mesh("bulb", points + np.array([1.0, 1.2, -0.8]), triangles, material=4)
-    bulb = dataclasses.replace(bulb, light=ir.MeshLight("bulb", placed(TILTED, (1.0, 1.2, -0.8)), spot))
-    sky = np.repeat(sky_texture()[:, :, None], 3, axis=2).astype(np.float32)
-    materials = (
-        ir.Material("wall", (0.7, 0.6, 0.5)),
-        ir.Material("a", (0.5,) * 3, (6.0, 4.0, 2.0)),
-        ir.Material("c", (0.0,) * 3, (20.0, 4.0, 4.0), glow=(1.0, 1.0, 1.0)),
-        ir.Material("e", (0.3,) * 3, (3.0, 3.0, 1.0)),
-        ir.Material("bulb", (0.0,) * 3, (16.0, 16.0, 18.0)),
-    )
-    return ir.Scene(
-        (walls, ball, shade, *panels, bulb),
-        materials,
-        (ir.Light("f", LightKind.DOME, (0.05,) * 3, texture=sky),),
-        ir.Camera.look_at((0.1, 0.2, 1.9), (0.0, 0.0, 0.0), fov=75.0),
-    )
-
-
-@pytest.mark.parametrize("estimator, absorption", [("keller", "fractional"), ("vpl", "roulette")])
-def test_vpls_agree_with_path(estimator, absorption):
-    """All of it at once: per pixel the difference over its standard error is a standard normal; so is the mean's.
-
-    Of 432 values at most 1 % may exceed 4.5: 4 of them, where rare bright paths make the tails of `path` long.
-    """
-    common = dict(width=12, height=12)
-    iterations = 32 if estimator == "keller" else 256
-    one = render(glowing_room(), estimator, iterations=iterations, light_paths=512, absorption=absorption, **common)
-    two = render(glowing_room(), "path", iterations=4096, **common)
-    error = np.hypot(one.standard_error(), two.standard_error())
-    z = (one.radiance() - two.radiance()) / np.maximum(error, 1e-12)
-    assert (np.abs(z) > 4.5).mean() <= 0.01
-    shift = float(one.radiance().mean() - two.radiance().mean())
-    assert abs(shift) < 4.0 * float(one.standard_error().mean())
 
 
 @pytest.mark.parametrize("change", [dict(shaping=Shaping(cone_angle=30.0)), dict(unlit=frozenset({9})), {}])

@@ -7,10 +7,12 @@ import pytest
 
 import warp_ir as ir
 from tests.physics.closed_form import assert_mean, placed, render
-from tests.physics.test_smooth_surfaces import ball, towards
+from tests.physics.scenes import ball, towards
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, quad
 from warp_ir.scene import Instances, LightKind, Texture
+
+pytestmark = pytest.mark.extended
 
 ALBEDO = 0.5
 TEXEL = np.array([0.75, -0.5, 1.25])  # exact in the halves that textures are kept in

@@ -10,6 +10,8 @@ from tests.physics.closed_form import render
 from warp_ir.metrics import relative_mse
 from warp_ir.procedural import cornell_box, furnace
 
+pytestmark = pytest.mark.extended
+
 
 def rms(a, b):
     return float(np.sqrt(np.mean((np.asarray(a, np.float64) - b) ** 2)))

@@ -8,6 +8,8 @@ import pytest
 import warp_ir as ir
 from tests.physics.closed_form import render
 
+pytestmark = pytest.mark.extended
+
 ROOT = Path(__file__).parents[2]
 
 SCENES = ["cornell_box", "furnace_cube", "thousand_lights", "crowded_room"]

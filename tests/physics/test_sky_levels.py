@@ -5,46 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from tests.physics.level import (
-    EYE,
-    assert_level,
-    at,
-    check,
-    floor,
-    level,
-    light,
-    load,
-    mesh,
-    panel,
-    placed,
-    rotation,
-    write_image,
-)
+from tests.physics.closed_form import placed, rotation
+from tests.physics.level import EYE, assert_level, at, check, floor, level, light, load, mesh, panel
+from tests.stages import photometry, sky_directions, write_image
+
+pytestmark = pytest.mark.extended
 
 TURN = rotation(1, 65.0) @ rotation(0, 25.0) @ rotation(2, -40.0)
-
-
-def directions(layout, n=48):
-    """The direction in the dome's frame that each pixel shows, [h, w, 3], and whether it shows any."""
-    if layout == "latlong":
-        theta, phi = np.meshgrid((np.arange(n) + 0.5) / n * np.pi, (np.arange(2 * n) + 0.5) / n * np.pi, indexing="ij")
-        # The middle column is +Z; to its right x grows less: the longitude falls from +π on the left edge.
-        phi = np.pi - phi
-        return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], -1)
-    if layout == "cubeMapVerticalCross":
-        out = np.zeros((4 * n, 3 * n, 3))
-        a, b = np.meshgrid((np.arange(n) + 0.5) / n * 2 - 1, 1 - (np.arange(n) + 0.5) / n * 2)
-        one = np.ones_like(a)
-        for row, column, face in [
-            (0, 1, (a, one, -b)), (1, 0, (-one, b, a)), (1, 1, (a, b, one)), (1, 2, (one, b, -a)),
-            (2, 1, (a, -one, b)), (3, 1, (a, -b, -one)),
-        ]:  # fmt: skip
-            out[row * n : (row + 1) * n, column * n : (column + 1) * n] = np.stack(face, -1)
-        return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-9)
-    a, b = np.meshgrid((np.arange(4 * n) + 0.5) / n / 2 - 1, 1 - (np.arange(4 * n) + 0.5) / n / 2)
-    r = np.maximum(np.hypot(a, b), 1e-9)
-    theta = np.pi * r if layout == "angular" else 2.0 * np.arcsin(np.minimum(r, 1.0))
-    return np.stack([np.sin(theta) * a / r, np.sin(theta) * b / r, np.cos(theta)], -1)
 
 
 @pytest.mark.parametrize("layout", ["latlong", "automatic", "angular", "mirroredBall", "cubeMapVerticalCross"])
@@ -60,7 +27,8 @@ def test_skies(tmp_path, layout, kind, axis, pole, up):
     """
     if layout not in ("latlong", "angular") and (kind, up) != ("DomeLight_1", "Z"):
         pytest.skip("layouts and orientations are independent of each other")
-    image = 2.0 + directions("latlong" if layout == "automatic" else layout)
+    size = 192 if layout in ("angular", "mirroredBall") else 48
+    image = 2.0 + np.nan_to_num(sky_directions("latlong" if layout == "automatic" else layout, size))
     write_image(tmp_path / "sky.exr", image.astype(np.float32))
     more = f"""asset inputs:texture:file = @sky.exr@
     {f'token inputs:texture:format = "{layout}"' if layout != "latlong" else ""}
@@ -104,13 +72,6 @@ def test_a_sun_in_a_sky(tmp_path, suffix):
     check(tmp_path, light("DomeLight", more, placed(turn)), expected, iterations=64, path=suffix == "exr")
 
 
-def photometry(kind, vertical, horizontal, candela, multiplier=1.0):
-    """The text of an IES file of type 1 (C), 2 (B) or 3 (A); candela [h, v]."""
-    numbers = "\n".join(" ".join(f"{x:g}" for x in row) for row in (vertical, horizontal, *candela))
-    head = f"1 1000 {multiplier} {len(vertical)} {len(horizontal)} {kind} 2 0 0 0\n1 1 100"
-    return f"IESNA:LM-63-1995\nTILT=NONE\n{head}\n{numbers}\n"
-
-
 HEIGHT = 1.6
 
 
@@ -137,7 +98,7 @@ def test_photometry(tmp_path, scale, normalize):
 
     θ in the file is θ / scale, or (θ - π) / -scale + π. The mean is ∫ f sinθ dθ = 100 - 180/π.
     """
-    (tmp_path / "lamp.ies").write_text(photometry(1, [0, 90, 180], [0], [[50, 5, -40]], multiplier=2))
+    (tmp_path / "lamp.ies").write_text(photometry([0, 90, 180], [0], [[50, 5, -40]], factor=2))
     angle = 25.0
     theta = {0.0: angle, 0.5: angle / 0.5, 2.0: angle / 2.0, -2.0: (angle - 180.0) / 2.0 + 180.0}[scale]
     candela = np.interp(theta, [0, 90, 180], [100, 10, 0])
@@ -156,10 +117,10 @@ def test_types_of_photometry(tmp_path, kind):
     """Types A and B count across to +X and up to +Y from the aim; C the azimuth from +X towards +Y around it."""
     angles = [-90, 0, 90]
     places = {(30.0, 0.0): 50 + 50 / 3, (0.0, 30.0): 50 + 10 / 3, (-30.0, 0.0): 40.0, (0.0, -30.0): 50 - 10 / 3}
-    text = photometry(3 if kind == "A" else 2, angles, angles, [[10, 20, 30], [40, 50, 60], [90, 100, 110]])
+    text = photometry(angles, angles, [[10, 20, 30], [40, 50, 60], [90, 100, 110]], kind=3 if kind == "A" else 2)
     if kind == "C":
         azimuths, candela = [0, 90, 180, 270, 360], [100, 200, 50, 10, 100]
-        text = photometry(1, [0, 90], azimuths, [[x, 0] for x in candela])
+        text = photometry([0, 90], azimuths, [[x, 0] for x in candela])
         for a, b in ((20.0, 20.0), (-30.0, 10.0), (-10.0, -40.0), (25.0, -15.0)):
             x, y = math.radians(a), math.radians(b)
             phi = math.degrees(math.atan2(math.sin(y), math.sin(x) * math.cos(y))) % 360.0

@@ -5,36 +5,13 @@ import pytest
 
 import warp_ir as ir
 from tests.physics import closed_form
+from tests.physics.scenes import ball, towards
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.scene import LightKind
 
+pytestmark = pytest.mark.extended
+
 ALBEDO = 0.8
-
-
-def ball(around=12, down=8, radius=1.0, center=(0.0, 0.0, 0.0)):
-    """A sphere of few triangles, with its own normals at their corners."""
-    longitude = 2 * np.pi * (np.arange(around) + 0.5) / around
-    latitude = np.pi * np.arange(down + 1) / down
-    ring = np.stack([np.cos(longitude), 0 * longitude, np.sin(longitude)], axis=1)
-    points = (np.sin(latitude)[:, None, None] * ring + np.cos(latitude)[:, None, None] * [0, 1, 0]).reshape(-1, 3)
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    rows = around * np.arange(down)[:, None]
-    upper = np.stack([rows + i, rows + j, rows + around + j], axis=-1)[1:].reshape(-1, 3)
-    lower = np.stack([rows + i, rows + around + j, rows + around + i], axis=-1)[:-1].reshape(-1, 3)
-    triangles = np.concatenate([upper, lower]).astype(np.int32)
-    normals = points[triangles].astype(np.float32)
-    material = np.zeros(len(triangles), dtype=np.int32)
-    return ir.Mesh("ball", radius * points + np.array(center), triangles, material, normals)
-
-
-def towards(direction):
-    """world_from_light of a light whose light comes from a direction."""
-    back = np.array(direction, dtype=float) / np.linalg.norm(direction)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = right, np.cross(back, right), back
-    return matrix
 
 
 def lit_ball(*lights, meshes=()):

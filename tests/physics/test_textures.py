@@ -11,6 +11,8 @@ from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, furnace, quad, sphere
 from warp_ir.scene import LightKind, Texture, Wrap
 
+pytestmark = pytest.mark.extended
+
 CHECKER = 0.2 + 0.6 * (np.indices((8, 8)).sum(axis=0) % 2)[..., None] * np.ones(3)
 
 

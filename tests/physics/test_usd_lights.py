@@ -1,15 +1,19 @@
 """From the file to the picture: every light of UsdLux under an uneven scale, normalized or not, over a white floor."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
 import pytest
 
 import warp_ir as ir
+from tests import stages
 from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
 from warp_ir.procedural import floor
 from warp_ir.scene import LightKind
+
+pytestmark = pytest.mark.extended
 
 SCALE = (1.6, 0.7, 0.5)
 AT = (0.3, 2.0, 0.1)
@@ -45,10 +49,7 @@ SHAPES = {
 }
 
 
-def load(folder, text):
-    file = folder / "light.usda"
-    file.write_text("#usda 1.0\n" + text)
-    return ir.load_usd(file, default_light="none")
+load = functools.partial(stages.load, default_light="none")
 
 
 def picture(scene, estimator, device):

@@ -15,6 +15,8 @@ from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphe
 from warp_ir.scene import LightKind
 from warp_ir.surface import closest
 
+pytestmark = pytest.mark.extended
+
 wp.set_module_options({"enable_backward": False})
 
 

@@ -1,7 +1,6 @@
 """Networks of shading nodes: textures in place, arithmetic on them, and what becomes of what cannot be read."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -9,49 +8,29 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdUtils
 
 import warp_ir as ir
-from tests.test_usd_material import QUADS, load, material_text, only_material, warned
-from tests.test_usd_texture import write
+from tests.stages import (
+    RAW,
+    READER,
+    RGBA,
+    ST,
+    UNPACK,
+    load,
+    material_text,
+    mesh,
+    only_material,
+    real_file,
+    textured,
+    warned,
+    write_image,
+)
 from warp_ir.scene import Wrap
 from warp_ir.usd.images.asset import srgb_to_linear
-
-ASSETS = Path(__file__).parents[2] / "shared" / "usd_assets"
-ST = "texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0), (2, 1)] (interpolation = 'vertex')"
-RGBA = np.arange(2 * 3 * 4).reshape(2, 3, 4).astype(np.uint8) * 10
-READER = """def Shader "R" {
-        uniform token info:id = "UsdPrimvarReader_float2"
-        string inputs:varname = "st"
-        float2 outputs:result
-    }"""
-
-
-def mesh(more=ST, name="M"):
-    """Two quads with the material A and a uv set."""
-    binding = "rel material:binding = </A>"
-    return f'def Mesh "{name}" (prepend apiSchemas = ["MaterialBindingAPI"]) {{{QUADS} {more}\n {binding}\n}}\n'
-
-
-def textured(
-    inputs="", output="rgb", target="color3f inputs:diffuseColor", file="a.png", place="R.outputs:result", nodes=READER
-):
-    """A UsdPreviewSurface with a UsdUVTexture on one input."""
-    text = material_text(f"{target}.connect = </A/T.outputs:{output}>")
-    shader = f"""
-    def Shader "T" {{
-        uniform token info:id = "UsdUVTexture"
-        asset inputs:file = @{file}@
-        float2 inputs:st.connect = </A/{place}>
-        {inputs}
-        float3 outputs:{output}
-    }}
-    {nodes}
-"""
-    return text.rstrip()[:-1] + shader + "}\n"
 
 
 @pytest.fixture
 def image(tmp_path):
     """a.png, of which the tests know every byte."""
-    write(tmp_path / "a.png", RGBA)
+    write_image(tmp_path / "a.png", RGBA)
     return RGBA / 255.0
 
 
@@ -114,7 +93,7 @@ def test_colour_spaces(tmp_path, image, space, decoded):
 
 def test_a_linear_wide_gamut_is_converted(tmp_path):
     """An image in ACEScg red becomes Rec.709's, negative parts cut: the colour space is the attribute's."""
-    write(tmp_path / "a.exr", np.float32([[[0.613, 0.070, 0.021]]]), oiio.FLOAT)
+    write_image(tmp_path / "a.exr", np.float32([[[0.613, 0.070, 0.021]]]), oiio.FLOAT)
     text = textured(file="a.exr").replace("@a.exr@", '@a.exr@ (colorSpace = "lin_ap1_scene")')
     pixels = only_material(load(tmp_path, text + mesh())).albedo_texture.pixels
     np.testing.assert_allclose(pixels[0, 0], (1.0, 0.0, 0.0), atol=2e-3)
@@ -138,14 +117,10 @@ def test_an_unknown_colour_space_is_named(tmp_path, image):
     assert warned(scene, "/A: inputs:file", "unknown colour space 'crayon'")
 
 
-UNPACK = "float4 inputs:scale = (2, 2, 2, 1)\n float4 inputs:bias = (-1, -1, -1, 0)"
-RAW = 'token inputs:sourceColorSpace = "raw"'
-
-
 def test_a_normal_map(tmp_path):
     """The pixels of a normal map are vectors: 128/127.5 - 1 of a byte; beyond the image the surface is smooth."""
     pixels = np.uint8([[[0, 128, 255], [255, 128, 128]]])
-    write(tmp_path / "a.png", pixels)
+    write_image(tmp_path / "a.png", pixels)
     scene = load(tmp_path, textured(f"{UNPACK}\n {RAW}", target="normal3f inputs:normal") + mesh())
     texture = only_material(scene).normal_texture
     np.testing.assert_allclose(texture.pixels, pixels / 127.5 - 1.0, atol=2.0**-11)
@@ -192,7 +167,7 @@ def test_images_inherit_a_colour_space_that_they_can_have(tmp_path, kind, name, 
     """As on the attribute itself, if both are linear or neither is; else the image is what "auto" makes of it."""
     linear = kind == "exr"
     pixels = np.float32([[[0.5, 0.25, 0.125]]]) if linear else np.uint8([[[128, 64, 32]]])
-    write(tmp_path / f"a.{kind}", pixels, oiio.FLOAT if linear else oiio.UINT8)
+    write_image(tmp_path / f"a.{kind}", pixels, oiio.FLOAT if linear else oiio.UINT8)
     text = textured(file=f"a.{kind}")
     found = only_material(load(tmp_path, spaced(text, name) + mesh())).albedo_texture.pixels
     own = text.replace(f"@a.{kind}@", f'@a.{kind}@ (colorSpace = "{name}")') if counts else text
@@ -236,7 +211,7 @@ NORMALMAP = """
 def test_normal_maps_of_materialx(tmp_path, surface):
     """The node normalmap unpacks and scales; other vectors are in world space, which images are not."""
     pixels = np.uint8([[[128, 128, 255], [255, 0, 128]]])
-    write(tmp_path / "a.png", pixels)
+    write_image(tmp_path / "a.png", pixels)
     name = "normal" if surface == "standard_surface" else "geometry_normal"
     inputs = f"float3 inputs:{name}.connect = </A/N.outputs:out>"
     text = material_text(inputs, shader=f"ND_{surface}_surfaceshader", output="mtlx:surface").rstrip()[:-1]
@@ -329,7 +304,7 @@ def test_bad_coordinates_are_named(tmp_path, image, more, word):
 def test_udim_tiles_are_one_texture(tmp_path):
     """Tiles 1001 and 1012 lie at (0, 0) and (1, 1); those that are missing show the fallback."""
     for number, value in ((1001, 255), (1012, 51)):
-        write(tmp_path / f"t.{number}.png", np.full((2, 2, 3), value, np.uint8))
+        write_image(tmp_path / f"t.{number}.png", np.full((2, 2, 3), value, np.uint8))
     text = textured('float4 inputs:fallback = (0.5, 0.25, 0, 1)\n token inputs:sourceColorSpace = "raw"',
                     file="./t.<UDIM>.png")  # fmt: skip
     texture = only_material(load(tmp_path, text + mesh())).albedo_texture
@@ -349,7 +324,7 @@ def test_opacity(tmp_path, image):
     np.testing.assert_allclose(material.opacity_texture.pixels[..., 0], image[..., 3], atol=2.0**-11)
     scene = load(tmp_path, textured(output="a", target=target) + mesh())
     assert only_material(scene).cutoff == 0.0 and warned(scene, "/A", "partial opacity")
-    write(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
+    write_image(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
     repeat = 'token inputs:wrapS = "repeat"\n token inputs:wrapT = "repeat"'
     opaque = only_material(load(tmp_path, textured(repeat, output="a", target=target) + mesh()))
     assert opaque.opacity_texture is None and opaque.opacity == 1.0
@@ -641,6 +616,7 @@ def test_the_same_scene_in_every_kind_of_file(tmp_path, image):
     assert films[0].aov("albedo").std() > 0.01
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "file, images",
     [
@@ -654,9 +630,7 @@ def test_the_same_scene_in_every_kind_of_file(tmp_path, image):
 )
 def test_real_files(file, images):
     """Files of others load with their images, and render."""
-    if not (ASSETS / file).exists():
-        pytest.skip("the files are not here")
-    scene = ir.load_usd(ASSETS / file)
+    scene = ir.load_usd(real_file(file))
     assert scene.stats["images"] == images
     settings = ir.RenderSettings(width=16, height=16, iterations=1, light_paths=64)
     assert np.isfinite(ir.render(scene, settings, device="cpu").radiance()).all()

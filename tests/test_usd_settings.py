@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from pxr import Tf, UsdGeom
 
-from tests.test_usd_look import mesh, textured
-from tests.test_usd_material import QUADS, diffuse, load, material_text, only_material
-from tests.test_usd_texture import write
+from tests.stages import QUADS, diffuse, load, material_text, mesh, only_material, textured, warned, write_image
 from warp_ir import InputError, RenderSettings, load_usd
 from warp_ir.cli import main
 from warp_ir.cli.arguments import parse
@@ -92,10 +90,6 @@ def stage(folder: Path, text: str, metadata: str = "") -> Path:
     file = folder / "stage.usda"
     file.write_text(f"#usda 1.0\n({metadata})\n{text}")
     return file
-
-
-def warned(scene, *words) -> bool:
-    return any(all(word in line for word in words) for line in scene.warnings)
 
 
 # ---- RenderSettings --------------------------------------------------------------------------------------
@@ -236,7 +230,7 @@ def test_info_lists(tmp_path, capsys):
 def test_info_tells_what_materials_are(tmp_path, capsys, monkeypatch):
     """Opacity, cut-outs and textures stand beside the colours, and of what there is nothing of no count is shown."""
     image = np.zeros((1, 1, 4), np.uint8)
-    write(tmp_path / "a.png", image)
+    write_image(tmp_path / "a.png", image)
     half = material_text("float inputs:opacity = 0.5", "B") + mesh(name="N").replace("</A>", "</B>")
     file = stage(
         tmp_path, textured("float inputs:opacityThreshold = 0.25") + mesh() + half, "startTimeCode = 3\nendTimeCode = 4"

@@ -20,6 +20,8 @@ from warp_ir.scene import LightKind
 from warp_ir.settings import GuidingSettings
 from warp_ir.vpl.guide import CELLS, SIDES
 
+pytestmark = pytest.mark.extended
+
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
 

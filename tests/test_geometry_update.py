@@ -10,6 +10,8 @@ from warp_ir.bvh import BvhForest
 from warp_ir.procedural import cube, mesh, sphere
 from warp_ir.scene import Instances
 
+pytestmark = pytest.mark.extended
+
 SETTINGS = ir.RenderSettings(width=24, iterations=2, light_paths=16, estimator="path", filter=False)
 ROOM = mesh("room", *cube(2.0), 0)
 BALL = sphere(level=4)  # 2048 triangles: it has a tree of its own

@@ -1,16 +1,11 @@
 """Skinning: meshes follow their skeletons and blend shapes, or stay at rest with a warning."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdSkel
 
+from tests.stages import area_vectors, load, real_file, warned
 from warp_ir import load_usd
-
-from .test_usd_mesh import area_vectors, load, warned
-
-ASSETS = Path(__file__).resolve().parents[2] / "shared" / "usd_assets" / "usdwg_usdz"
 
 # A strip along x from 0 to 2 whose second bone, from x = 1, turns by 90° about z: frame 0 at rest, frame 10 turned.
 POINTS = [(0, 0, 0), (0, 0, 1), (1, 0, 0), (1, 0, 1), (2, 0, 0), (2, 0, 1)]
@@ -224,11 +219,11 @@ def test_outside_of_a_skel_root_nothing_is_skinned(tmp_path):
     assert np.linalg.norm(area_vectors(scene.meshes[0]), axis=1).sum() == pytest.approx(2.0)
 
 
-@pytest.mark.skipif(not ASSETS.exists(), reason="needs the collection of real files")
+@pytest.mark.extended
 @pytest.mark.parametrize(("name", "time"), [("CesiumMan", 10.0), ("RiggedSimple", 10.0), ("RiggedFigure", 0.0)])
 def test_real_figures_are_where_usd_bakes_them(name, time):
     """BakeSkinning, on a layer of its own, puts the points where they are drawn (to its float32)."""
-    file = ASSETS / "test_assets" / "USDZ" / name / f"{name}.usdz"
+    file = real_file(f"usdwg_usdz/test_assets/USDZ/{name}/{name}.usdz")
     mesh = load_usd(file, time=time).meshes[0]
     stage = Usd.Stage.Open(str(file))
     stage.SetEditTarget(stage.GetSessionLayer())

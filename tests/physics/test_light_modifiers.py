@@ -7,36 +7,32 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-from tests.physics.closed_form import assert_mean, irradiance_at_origin, placed, render, rotation_x
+from tests.physics.closed_form import (
+    assert_mean,
+    bilinear,
+    factor,
+    irradiance_at_origin,
+    placed,
+    render,
+    rotation_x,
+)
+from tests.physics.scenes import (
+    DOWN,
+    LAMP,
+    SHAPINGS,
+    SQUEEZED,
+    TILTED,
+    ball_over_floor,
+    lamp_profile,
+    over_floor,
+    pixels,
+    sky_texture,
+)
 from warp_ir.estimators import ESTIMATORS
-from warp_ir.procedural import cube, floor, mesh, quad, sphere
+from warp_ir.procedural import cube, mesh
 from warp_ir.scene import LightKind, Shaping
 
-DOWN = rotation_x(-90.0)  # takes the light's -Z to the world's -Y
-TILTED = rotation_x(-70.0)
-SQUEEZED = np.diag([1.5, 1.0, 0.5])
-
-
-def over_floor(light, estimator, device, **settings):
-    return render(floor(light), estimator, device, **(dict(max_bounces=0, light_paths=1024) | settings))
-
-
-def factor(shaping, cosine):
-    """The text of UsdLux: focus and cone at an angle to the axis; grey tint."""
-    focus = np.abs(cosine) ** shaping.focus
-    tinted = shaping.focus_tint[0] + (1.0 - shaping.focus_tint[0]) * focus
-    edge = math.radians(shaping.cone_angle)
-    theta = np.arccos(np.clip(cosine, -1.0, 1.0))
-    t = np.clip((theta - edge * (1.0 - shaping.cone_softness)) / max(edge * shaping.cone_softness, 1e-9), 0.0, 1.0)
-    return tinted * (1.0 - t * t * (3.0 - 2.0 * t))
-
-
-SHAPINGS = [
-    Shaping(cone_angle=40.0, cone_softness=0.8),
-    Shaping(cone_angle=90.0, focus=8.0),
-    Shaping(focus=3.0, focus_tint=(0.25,) * 3),
-    Shaping(cone_angle=35.0),
-]
+pytestmark = pytest.mark.extended
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -128,13 +124,6 @@ def test_photons_carry_the_power_of_the_cone(angle):
         assert flux == pytest.approx(power, rel=2e-3) and part > used, kind
 
 
-def lamp_profile(rows=180, columns=8):
-    """A profile with a dark sector, in candela-like numbers: 100 (1 + cos 2θ) down to 120°, times 1 or 1/4 around."""
-    theta = np.pi * (np.arange(rows) + 0.5) / rows
-    around = np.where(np.arange(columns) < columns // 2, 1.0, 0.25)
-    return (100.0 * (1.0 + np.cos(2.0 * theta)) * (theta < math.radians(120.0)))[:, None] * around
-
-
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("position, around", [((0, 2, 1), 1.0), ((0, 2, -1), 0.25), ((1, 2, 0), 0.625)])
 def test_profiles_of_lamps(position, around, estimator, device):
@@ -161,20 +150,6 @@ def test_photons_follow_a_profile():
     assert flux_after_one_bounce(ball)[0] == pytest.approx(power * math.pi * 0.09, rel=3e-3)
 
 
-def bilinear(texture, x, y, *, around=False):
-    """Independent of the renderer's: texture [h, w] at x, y in units of texels, centres at halves."""
-    height, width = texture.shape
-    i, j = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
-    fx, fy = x - 0.5 - i, y - 0.5 - j
-
-    def at(row, column):
-        column = column % width if around else np.clip(column, 0, width - 1)
-        return texture[np.clip(row, 0, height - 1), column]
-
-    upper = at(j, i) * (1 - fx) + at(j, i + 1) * fx
-    return upper * (1 - fy) + (at(j + 1, i) * (1 - fx) + at(j + 1, i + 1) * fx) * fy
-
-
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_textured_rectangles(estimator, device):
     """E = ∫ L T cosθ cosθ' / d² dA with row 0 of the texture at +Y, and column 0 at +X."""
@@ -182,7 +157,7 @@ def test_textured_rectangles(estimator, device):
     lamp = ir.Light("lamp", LightKind.RECT, (3.0,) * 3, placed(TILTED, (0.3, 1.0, 0.4)), width=1.5, height=0.8)
 
     def towards(u, v, direction):
-        return bilinear(texture, (1.0 - u) * 3, (1.0 - v) * 2)
+        return bilinear(texture, 1.0 - u, 1.0 - v)
 
     expected = irradiance_at_origin(lamp, factor=towards) / math.pi
     lamp = dataclasses.replace(lamp, texture=np.repeat(texture[:, :, None], 3, axis=2).astype(np.float32))
@@ -198,16 +173,8 @@ def sky_irradiance(texture, matrix, n=1500):
     d = up @ matrix[:3, :3]  # in the dome's own frame
     u = (0.5 - np.arctan2(d[..., 0], d[..., 2]) / (2.0 * np.pi)) % 1.0
     v = np.arccos(np.clip(d[..., 1], -1.0, 1.0)) / np.pi
-    light = bilinear(texture, u * texture.shape[1], v * texture.shape[0], around=True)
+    light = bilinear(texture, u, v, around=True)
     return float((light * np.cos(theta) * np.sin(theta)).sum() * (0.5 * np.pi / n) * (2.0 * np.pi / (2 * n)))
-
-
-def sky_texture():
-    """A gradient, a black patch, and a sun of 2000 times its brightness in one texel."""
-    texture = np.linspace(1.0, 0.2, 16)[:, None] * np.linspace(1.0, 2.0, 32)[None, :]
-    texture[9:, 4:20] = 0.0
-    texture[4, 11] = 2000.0
-    return texture
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -247,21 +214,6 @@ def test_the_eye_sees_the_sky():
         np.testing.assert_allclose(film.radiance()[..., :2].mean(axis=(0, 1)), [red, green], atol=2e-2)
 
 
-def ball_over_floor(light):
-    """A floor with a ball on it, seen from the side; meshes 0 and 1."""
-    points, triangles = sphere(0.4, level=3)
-    ground = quad("ground", [(-5, 0, 5), (5, 0, 5), (5, 0, -5), (-5, 0, -5)])
-    return ir.Scene(
-        meshes=(ground, mesh("ball", points + np.array([0.0, 0.6, 0.0]), triangles)),
-        materials=(ir.Material("white", (0.8,) * 3),),
-        lights=(light,),
-        camera=ir.Camera.look_at((0.0, 2.5, 3.0), (0.0, 0.0, 0.0)),
-    )
-
-
-LAMP = ir.Light("lamp", LightKind.RECT, (4.0,) * 3, placed(DOWN, (0.2, 2.5, 0.1)), width=0.6, height=0.6)
-
-
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_links_say_what_a_light_lights(estimator):
     """An unlinked mesh has no direct light, exactly; and the linked one no light by way of it."""
@@ -274,10 +226,6 @@ def test_links_say_what_a_light_lights(estimator):
         assert (direct[mesh_seen == unlit] == 0.0).all() and direct[mesh_seen == 1 - unlit].mean() > 0.01
         indirect = film.aov("indirect")
         assert (indirect[mesh_seen == 1 - unlit] == 0.0).all()
-
-
-def pixels(film, which):
-    return film.radiance()[which].mean(), film.standard_error()[which].mean()
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -300,55 +248,6 @@ def test_light_passes_through_shadowless_meshes(estimator):
         mean, error = pixels(film, under)
         expected, expected_error = pixels(free, under)
         assert abs(mean - expected) <= 5.0 * math.hypot(error, expected_error)
-
-
-def everything():
-    """A room with every kind of light, and all that can be asked of them."""
-    points, triangles = sphere(0.5, level=2)
-    ball = mesh("ball", points + np.array([0.7, -1.0, 0.3]), triangles)
-    shade = quad("shade", [(-1.2, 0.9, -0.6), (-0.2, 0.9, -0.6), (-0.2, 0.9, 0.4), (-1.2, 0.9, 0.4)])
-    texture = np.random.default_rng(1).random((5, 7, 3)).astype(np.float32) ** 4
-    sky = np.repeat(sky_texture()[:, :, None], 3, axis=2).astype(np.float32)
-    lights = (
-        ir.Light("a", LightKind.RECT, (6.0, 4.0, 2.0), placed(DOWN, (-0.7, 1.5, 0.0)), width=0.8, height=0.5,
-                 texture=texture, shadowless=frozenset({2})),
-        ir.Light("b", LightKind.SPHERE, (8.0, 8.0, 9.0), placed(TILTED, (1.0, 1.2, -0.8)), radius=0.15,
-                 shaping=Shaping(cone_angle=50.0, cone_softness=0.5, focus=1.0, focus_tint=(0.5, 0.1, 0.0))),
-        ir.Light("c", LightKind.DISK, (9.0, 2.0, 2.0), placed(rotation_x(20.0), (0.0, 0.0, 1.5)), radius=0.2,
-                 shaping=Shaping(cone_angle=25.0), unlit=frozenset({1})),
-        ir.Light("d", LightKind.POINT, (0.004,) * 3, placed(DOWN, (-1.5, 0.4, 1.0)),
-                 shaping=Shaping(profile=lamp_profile())),
-        ir.Light("e", LightKind.CYLINDER, (3.0, 3.0, 1.0), placed(SQUEEZED, (0.5, -1.8, -1.2)), length=1.0, radius=0.05,
-                 shadows=False),
-        ir.Light("f", LightKind.DOME, (0.05,) * 3, texture=sky),
-        ir.Light("g", LightKind.DISTANT, (30.0,) * 3, placed(rotation_x(-50.0), (0, 0, 0)), angle=5.0),
-    )  # fmt: skip
-    # Open towards +z, where the sky looks in.
-    points, triangles = cube(4.0, inward=True)
-    normals = np.cross(
-        points[triangles][:, 1] - points[triangles][:, 0], points[triangles][:, 2] - points[triangles][:, 0]
-    )
-    walls = mesh("walls", points, triangles[normals[:, 2] > -1e-6])
-    camera = ir.Camera.look_at((0.1, 0.2, 3.5), (0.0, 0.0, 0.0), fov=60.0)
-    materials = (ir.Material("wall", (0.7, 0.6, 0.5)),)
-    return ir.Scene((walls, ball, shade), materials, lights, camera)
-
-
-@pytest.mark.parametrize("estimator, absorption", [("keller", "fractional"), ("vpl", "roulette")])
-def test_vpls_agree_with_path(estimator, absorption):
-    """All of it at once: per pixel the difference over its standard error is a standard normal; so is the mean's.
-
-    Of 432 values at most 1 % may exceed 4.5: 4 of them, where rare bright paths make the tails of `path` long.
-    """
-    common = dict(width=12, height=12)
-    iterations = 32 if estimator == "keller" else 256
-    one = render(everything(), estimator, iterations=iterations, light_paths=512, absorption=absorption, **common)
-    two = render(everything(), "path", iterations=4096, **common)
-    error = np.hypot(one.standard_error(), two.standard_error())
-    z = (one.radiance() - two.radiance()) / np.maximum(error, 1e-12)
-    assert (np.abs(z) > 4.5).mean() <= 0.01
-    shift = float(one.radiance().mean() - two.radiance().mean())
-    assert abs(shift) < 4.0 * float(one.standard_error().mean())
 
 
 @pytest.mark.parametrize("shaping", [Shaping(cone_angle=20.0), Shaping(cone_angle=30.0, cone_softness=1.0)])

@@ -7,24 +7,9 @@ import OpenImageIO as oiio
 import pytest
 from pxr import Sdf, Usd, UsdUtils
 
+from tests.stages import write_image
 from warp_ir.usd.images.asset import read_texture, srgb_to_linear
 from warp_ir.usd.values.report import Unreadable
-
-
-def write(path, pixels, kind=oiio.UINT8, **attributes):
-    """Stores values as they are."""
-    pixels = np.atleast_3d(pixels)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    for name, value in attributes.items():
-        spec.attribute(name, value)
-    if spec.nchannels == 2:
-        spec.channelnames = ("Y", "A")
-    writer = oiio.ImageOutput.create(str(path))
-    assert writer.open(str(path), spec) and writer.write_image(np.ascontiguousarray(pixels)), writer.geterror()
-    writer.close()
-    return str(path)
-
 
 GRADIENT = np.arange(2 * 3 * 4).reshape(2, 3, 4) * 10
 
@@ -34,7 +19,7 @@ GRADIENT = np.arange(2 * 3 * 4).reshape(2, 3, 4) * 10
 def test_eight_bits(tmp_path, channels, space):
     """Automatic is sRGB for three and four channels; alpha is never decoded."""
     stored = GRADIENT[..., :channels].astype(np.uint8)
-    image = read_texture(write(tmp_path / "a.png", stored), space)
+    image = read_texture(write_image(tmp_path / "a.png", stored), space)
     expected = stored / 255.0
     colors = channels if channels in (1, 3) else channels - 1
     if space == "sRGB" or (space == "auto" and channels > 2):
@@ -54,7 +39,7 @@ def test_more_than_eight_bits_are_linear(tmp_path, name, kind, top):
     """Half, float and 16-bit images hold light unless they are said to be sRGB. Half keeps 11 bits."""
     values = GRADIENT[..., :3] / 256.0
     stored = np.round(values * top).astype(np.uint16) if top > 1 else values.astype(np.float32)
-    image = read_texture(write(tmp_path / name, stored, kind))
+    image = read_texture(write_image(tmp_path / name, stored, kind))
     np.testing.assert_allclose(image.pixels, values, atol=2e-5)
     decoded = read_texture(str(tmp_path / name), "sRGB")
     np.testing.assert_allclose(decoded.pixels, srgb_to_linear(values), atol=2e-5)
@@ -63,13 +48,13 @@ def test_more_than_eight_bits_are_linear(tmp_path, name, kind, top):
 def test_radiance_files_keep_their_range(tmp_path):
     """A .hdr holds more than 1; its shared exponent leaves 8 bits."""
     values = np.array([[[100.0, 50.0, 25.0], [0.0, 0.0, 0.0]]], np.float32)
-    image = read_texture(write(tmp_path / "a.hdr", values, oiio.FLOAT))
+    image = read_texture(write_image(tmp_path / "a.hdr", values, oiio.FLOAT))
     np.testing.assert_allclose(image.pixels, values, rtol=2.0**-7)
 
 
 def test_values_that_are_no_numbers(tmp_path):
     """NaN is black, infinity the largest half."""
-    image = read_texture(write(tmp_path / "a.exr", np.float32([[[np.nan, np.inf, 1.0]]]), oiio.FLOAT))
+    image = read_texture(write_image(tmp_path / "a.exr", np.float32([[[np.nan, np.inf, 1.0]]]), oiio.FLOAT))
     assert image.pixels[0, 0].tolist() == [0.0, 65504.0, 1.0]
 
 
@@ -110,14 +95,14 @@ def test_large_images_are_averaged_down(tmp_path, monkeypatch, tile, limit):
 
 def test_wrap_modes_of_the_file(tmp_path):
     """What the file says of its edges is passed on."""
-    path = write(tmp_path / "a.exr", np.ones((1, 1, 3), np.float32), oiio.FLOAT, wrapmodes="periodic,clamp")
+    path = write_image(tmp_path / "a.exr", np.ones((1, 1, 3), np.float32), oiio.FLOAT, wrapmodes="periodic,clamp")
     assert read_texture(path).wrap == ("repeat", "clamp")
-    assert read_texture(write(tmp_path / "b.exr", np.ones((1, 1, 3), np.float32), oiio.FLOAT)).wrap == ("", "")
+    assert read_texture(write_image(tmp_path / "b.exr", np.ones((1, 1, 3), np.float32), oiio.FLOAT)).wrap == ("", "")
 
 
 def test_inside_a_package(tmp_path):
     """An image in a .usdz is the same as beside a .usda."""
-    path = write(tmp_path / "a.png", GRADIENT[..., :3].astype(np.uint8))
+    path = write_image(tmp_path / "a.png", GRADIENT[..., :3].astype(np.uint8))
     stage = Usd.Stage.CreateNew(str(tmp_path / "s.usda"))
     prim = stage.DefinePrim("/P")
     prim.CreateAttribute("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath("./a.png"))
@@ -131,7 +116,7 @@ def test_inside_a_package(tmp_path):
 
 def test_what_is_no_image_is_named(tmp_path):
     """Missing, empty, cut off, something else, a folder, or larger than anything real: one line with the name."""
-    write(tmp_path / "good.png", np.random.default_rng(1).integers(0, 255, (64, 64, 3), np.uint8))
+    write_image(tmp_path / "good.png", np.random.default_rng(1).integers(0, 255, (64, 64, 3), np.uint8))
     content = (tmp_path / "good.png").read_bytes()
     (tmp_path / "cut.png").write_bytes(content[: len(content) // 2])
     (tmp_path / "empty.png").write_bytes(b"")

@@ -109,6 +109,7 @@ def test_films_of_some_tiles_merge():
     np.testing.assert_array_equal(pixels_of(films[0].tile_iterations, films[0])[..., None], n[0] + n[1])
 
 
+@pytest.mark.extended
 def test_a_target_leaves_out_good_tiles(tmp_path):
     """A render to an error skips samples, reaches it, has the same bits on any number of threads, and when resumed."""
     scene, target = cornell_box(), 0.08

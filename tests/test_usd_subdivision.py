@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 import warp_ir.usd.geometry.subdivision
+from tests.stages import SQUARE, area, area_vectors, load, mesh_text, volume, warned
 from warp_ir import InputError
 from warp_ir.cli import main
 from warp_ir.usd.geometry.refine import INFINITE, Cage, Refinement, Scheme
-
-from .test_usd_mesh import SQUARE, area, area_vectors, load, mesh_text, volume, warned
 
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

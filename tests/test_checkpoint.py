@@ -65,6 +65,7 @@ def command(picture, *more):
     return ["render", ROOM, str(picture), *SMALL, *more]
 
 
+@pytest.mark.extended
 def test_kill_loses_no_more_than_an_interval(tmp_path):
     """Kill -9, then --resume: the picture of a command that was left in peace, bit for bit, and no trace beside it."""
     picture, other = tmp_path / "a.npy", tmp_path / "b.npy"
