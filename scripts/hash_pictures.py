@@ -63,6 +63,29 @@ def turntable() -> ir.Scene:
     return ir.StageReader(SCENES / "turntable.usda").read(4.0)
 
 
+def blurred() -> ir.Scene:
+    """The Cornell box; its last mesh moves and its camera pans while the shutter is open, in four samples."""
+    scene = ir.load_usd(SCENES / "cornell_box.usda")
+
+    def sample(time: float) -> ir.Scene:
+        last = replace(scene.meshes[-1], points=scene.meshes[-1].points + [40.0 * time, 20.0 * time, 0.0])
+        pan = np.eye(4)
+        pan[0, 3] = 10.0 * time
+        camera = replace(scene.camera, world_from_camera=pan @ scene.camera.world_from_camera)
+        return replace(scene, meshes=(*scene.meshes[:-1], last), camera=camera)
+
+    return replace(scene, shutter=tuple(sample(k / 4) for k in range(4)))
+
+
+def instanced() -> ir.Scene:
+    """The Cornell box with two copies of its last mesh as instances, one of them mirrored."""
+    scene = ir.load_usd(SCENES / "cornell_box.usda")
+    matrices = np.stack([np.eye(4), np.diag([-1.0, 1.0, 1.0, 1.0])])
+    matrices[1, 0, 3] = 556.0
+    last = len(scene.meshes) - 1
+    return replace(scene, instances=(ir.Instances("copies", (last,), matrices),))
+
+
 def renders() -> Iterator[tuple[str, Render]]:
     """The name of each picture and the function that renders it."""
     small = {"width": 64, "iterations": 6}
@@ -86,8 +109,11 @@ def renders() -> Iterator[tuple[str, Render]]:
         yield f"{name} path", film_of(stage(name), estimator="path", visible_lights=True, width=48, iterations=2)
     for name in ("furnace_sphere", "furnace_cube"):
         yield f"{name} vpl", film_of(stage(name), width=32, iterations=4)
-    yield "turntable blurred vpl", film_of(turntable, **small)
-    yield "turntable blurred path", film_of(turntable, estimator="path", width=48, iterations=2)
+    yield "turntable vpl", film_of(turntable, **small)
+    yield "turntable path", film_of(turntable, estimator="path", width=48, iterations=2)
+    yield "cornell_box blurred vpl", film_of(blurred, **small)
+    yield "cornell_box blurred path", film_of(blurred, estimator="path", width=48, iterations=4)
+    yield "cornell_box instanced vpl", film_of(instanced, **small)
     for name in ("cornell_box", "light_types", "two_rooms"):
         yield f"{name} vpls", vpls_of(stage(name))
 
