@@ -68,7 +68,7 @@ def blurred() -> ir.Scene:
     scene = ir.load_usd(SCENES / "cornell_box.usda")
 
     def sample(time: float) -> ir.Scene:
-        last = replace(scene.meshes[-1], points=scene.meshes[-1].points + [40.0 * time, 20.0 * time, 0.0])
+        last = replace(scene.meshes[-1], points=scene.meshes[-1].points + np.array([40.0 * time, 20.0 * time, 0.0]))
         pan = np.eye(4)
         pan[0, 3] = 10.0 * time
         camera = replace(scene.camera, world_from_camera=pan @ scene.camera.world_from_camera)

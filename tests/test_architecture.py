@@ -199,7 +199,7 @@ RETIRED_WORDS = [
     (r"(?<!in )foreign", "vendor"),
     (r"feels?", "depends on, contributes to"),
     (r"g[ia]ve[sn]? back|gives? it back", "compensate, shrink"),
-    (r"glow(s|ed|ing)", "emit, emissive; `glow` is the public field alone"),
+    (r"(?<!\.)(?<!def )glow(s|ed|ing)", "emit, emissive; `glow` is the public field alone"),
 ]
 """Words that stand for nothing in the field, in code, comments and prose, and what to write instead."""
 RETIRED_NAMES = {

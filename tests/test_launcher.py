@@ -37,25 +37,25 @@ def test_cancel_abandons():
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_beside_is_done_when_its_block_ends(threads):
-    """Launches beside a block and those in it all run, every index once, however often they meet."""
+def test_overlapped_launches_are_done_when_the_block_ends(threads):
+    """Overlapped launches and those in the block all run, every index exactly one time."""
     launcher = Launcher("cpu", threads)
-    beside, inside = launcher.zeros(5000, wp.int32), launcher.zeros(5000, wp.int32)
+    overlapped, inside = launcher.zeros(5000, wp.int32), launcher.zeros(5000, wp.int32)
     for count in (1, 300, 5000, 5000, 5000):  # bands are cut by what earlier launches have taken
-        beside.zero_(), inside.zero_()
-        with launcher.beside("beside", lambda count=count: launcher.launch(_square, count, [beside])):
+        overlapped.zero_(), inside.zero_()
+        with launcher.overlap("overlap", lambda count=count: launcher.launch(_square, count, [overlapped])):
             for begin in (0, count // 2):
                 part = count // 2 if begin == 0 else count - begin
                 launcher.launch(_square, part, [inside[begin:]])
         expected = np.arange(count, dtype=np.int32) ** 2
-        np.testing.assert_array_equal(beside.numpy()[:count], expected)
+        np.testing.assert_array_equal(overlapped.numpy()[:count], expected)
         np.testing.assert_array_equal(inside.numpy()[: count // 2], expected[: count // 2])
         np.testing.assert_array_equal(inside.numpy()[count // 2 : count], expected[: count - count // 2])
-    assert launcher.profile.seconds()["beside"] > 0.0
+    assert launcher.profile.seconds()["overlap"] > 0.0
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_what_is_beside_ends_with_its_block(threads):
+def test_overlapped_launches_end_with_the_block(threads):
     """An error in the block, or `cancel`, leaves no launch behind that would go on writing."""
     launcher = Launcher("cpu", threads)
     out = launcher.zeros(100_000, wp.int32)
@@ -63,10 +63,10 @@ def test_what_is_beside_ends_with_its_block(threads):
     def start():
         launcher.launch(_square, 100_000, [out])
 
-    with pytest.raises(ZeroDivisionError), launcher.beside("beside", start):
+    with pytest.raises(ZeroDivisionError), launcher.overlap("overlap", start):
         raise ZeroDivisionError
     np.testing.assert_array_equal(out.numpy()[:1000], np.arange(1000, dtype=np.int32) ** 2)
-    with pytest.raises(Cancelled), launcher.beside("beside", start):
+    with pytest.raises(Cancelled), launcher.overlap("overlap", start):
         launcher.cancel()
     out.zero_()
     launcher.resume()
@@ -74,12 +74,12 @@ def test_what_is_beside_ends_with_its_block(threads):
     assert out.numpy().max() == 0
 
 
-def test_undisturbed_runs_to_its_end():
+def test_uninterruptible_launches_run_to_their_end():
     """What must be done entirely or not at all is done in spite of `cancel`, which takes effect after it."""
     launcher = Launcher("cpu", 2)
     out = launcher.zeros(1000, wp.int32)
     launcher.cancel()
-    with launcher.undisturbed():
+    with launcher.uninterruptible():
         launcher.launch(_square, 1000, [out])
     np.testing.assert_array_equal(out.numpy(), np.arange(1000, dtype=np.int32) ** 2)
     with pytest.raises(Cancelled):

@@ -249,7 +249,14 @@ def reflecting_pixel(gbuffer: GBuffer, index: int) -> int:
 
 
 def new_gbuffer(
-    launcher: Launcher, columns: int, rows: int, *, mapped: bool, glows: bool, moving: bool = False, spare: int = 0
+    launcher: Launcher,
+    columns: int,
+    rows: int,
+    *,
+    has_normal_maps: bool,
+    has_emission: bool,
+    moving: bool = False,
+    spare: int = 0,
 ) -> tuple[GBuffer, wp.array[wp.float32]]:
     """An uninitialised `GBuffer` of all pixels, and the block of float32 that most of its arrays lie in.
 
@@ -259,13 +266,13 @@ def new_gbuffer(
         launcher: Where to allocate.
         columns: Pixels across.
         rows: Pixels down.
-        mapped: Whether the scene has normal maps.
-        glows: Whether the camera may see anything that emits.
+        has_normal_maps: Whether the scene has normal maps.
+        has_emission: Whether the camera may see anything that emits.
         moving: Whether surfaces move while the shutter is open.
         spare: Least size of the block [float32 per pixel].
     """
     vectors = ["position", "normal_or_direct", "indirect", "shading_normal", "albedo"]
-    vectors += ["smooth_normal"] * mapped + ["emission"] * glows
+    vectors += ["smooth_normal"] * has_normal_maps + ["emission"] * has_emission
     types = [*[wp.vec3] * len(vectors), wp.int32, wp.float32]
     pixels = columns * rows
     block = launcher.empty(pixels * max(float_count(*types), spare), wp.float32)
@@ -276,9 +283,9 @@ def new_gbuffer(
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)
     gbuffer.surface_point = launcher.empty(pixels if moving else 0, SurfacePoint)
-    if not glows:
+    if not has_emission:
         gbuffer.emission = launcher.empty(0, wp.vec3)
-    if not mapped:
+    if not has_normal_maps:
         gbuffer.smooth_normal = gbuffer.shading_normal
     return gbuffer, block
 

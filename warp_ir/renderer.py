@@ -256,8 +256,8 @@ class _BufferLayout:
             launcher,
             self.columns,
             self.rows,
-            mapped=self.normal_maps,
-            glows=self.emission,
+            has_normal_maps=self.normal_maps,
+            has_emission=self.emission,
             moving=self.moving,
             spare=self.spare,
         )

@@ -138,7 +138,9 @@ def trace_camera_probes(
     whole.visible_lights = 0
     paths = whole.columns * whole.rows
     scramble = sobol.iteration_scramble(settings.seed, _CAMERA_PATHS)
-    gbuffer, _ = new_gbuffer(launcher, whole.columns, whole.rows, mapped=scene.data.normal_map_count > 0, glows=False)
+    gbuffer, _ = new_gbuffer(
+        launcher, whole.columns, whole.rows, has_normal_maps=scene.data.normal_map_count > 0, has_emission=False
+    )
     trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
     n = paths * _MAX_VERTICES * _EMITTER_SAMPLES
     rows = ProbeRows()

@@ -53,7 +53,7 @@ class LevelGroup:
     children: "list[LevelGroup]" = field(default_factory=list)
     flattened: bool = False
     """Whether its instances are flattened into the parent."""
-    stored_once: bool = False
+    stored: bool = False
     """Whether it is stored as a prototype."""
 
     @property
@@ -168,7 +168,7 @@ class _LevelTree:
         while group.flattened:
             assert group.parent is not None and level.parent is not None
             group, level = group.parent, level.parent
-        return (group, level) if group.stored_once else (None, None)
+        return (group, level) if group.stored else (None, None)
 
     def decide(self) -> None:
         """Chooses which groups are flattened and which are stored once."""
@@ -178,13 +178,13 @@ class _LevelTree:
             size += sum(child.instance_count * sizes[id(child)] for child in group.children if child.flattened)
             sizes[id(group)] = size
             if group.parent is not None and group.parent.world_count > 1:
-                stored_once = _TRIANGLE_BYTES * size + _INSTANCE_BYTES * group.world_count
-                group.flattened = _TRIANGLE_BYTES * size * group.instance_count <= stored_once
+                stored = _TRIANGLE_BYTES * size + _INSTANCE_BYTES * group.world_count
+                group.flattened = _TRIANGLE_BYTES * size * group.instance_count <= stored
         candidates = [g for g in self._groups if not g.flattened and g.world_count > 1 and sizes[id(g)]]
         flattened_triangles = 0
         for group in sorted(candidates, key=lambda g: g.world_count * sizes[id(g)]):
             flattened_triangles += group.world_count * sizes[id(group)]
-            group.stored_once = flattened_triangles > MAX_FLATTENED_TRIANGLES
+            group.stored = flattened_triangles > MAX_FLATTENED_TRIANGLES
 
     def _grouped(self, parent: LevelGroup | None, siblings: Sequence[InstanceLevel]) -> list[LevelGroup]:
         """Sibling levels, grouped by equal contents."""
