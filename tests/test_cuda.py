@@ -155,7 +155,7 @@ def test_iterations_read_nothing_back(scene, settings, capacity, monkeypatch):
         monkeypatch.setattr(warp_ir.vpl.emission, "_MAX_CAPACITY", capacity)
     expected = ir.render(scene, settings)
     renderer = Renderer(scene, settings)
-    renderer.launcher.waits = False
+    renderer.launcher.synchronous = False
     film = renderer.new_film()
     with blind(monkeypatch) as waits:
         for iteration in range(3):
@@ -180,7 +180,7 @@ def test_guided_iterations_read_nothing_back(name, monkeypatch):
     expected = ir.render(scene, settings)
     assert expected.counts["guided_vpls"] == 1
     renderer = Renderer(scene, settings)
-    renderer.launcher.waits = False
+    renderer.launcher.synchronous = False
     film = renderer.new_film()
     for iteration in range(2):
         renderer.add_iteration(film, iteration)

@@ -1,11 +1,9 @@
-"""What the camera sees: one jittered ray per pixel, and the surface it meets.
+"""The G-buffer: what the camera sees, by one jittered ray per pixel and iteration.
 
-The jitter of a pixel is a (0,2)-sequence over the iterations, scrambled by pixel: the first 2^k iterations
-sample the pixel's area in as many strata, so edges converge faster than noise. The next two dimensions choose
-the point on the lens, if the camera has one.
+The jitter of a pixel is a (0,2)-sequence over the iterations, scrambled per pixel: the first 2^k iterations lie in as
+many strata of the pixel's area, so edges converge faster than noise. The next two sample dimensions choose the point on
+the lens, if the camera has one.
 """
-
-from typing import Any
 
 import warp as wp
 
@@ -19,40 +17,40 @@ from warp_ir.tiles import Tiles, all_tiles, indices, pixel_at, skipped_iteration
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_FARTHEST = wp.constant(1.0e30)  # a plane that a ray meets only there is parallel to it
+_FARTHEST = wp.constant(1.0e30)  # a ray is parallel to a plane that it meets only beyond this
 _JITTER = wp.constant(wp.uint32(0x6A09E667))
 
 
 @wp.struct
 class SurfacePoint:
-    """A point of a triangle, wherever that goes while the shutter is open."""
+    """A point of a triangle by its barycentric coordinates, which stays on the triangle while that moves."""
 
     triangle: int
-    instance: int  # -1: in the world as it stands
-    weights: wp.uint32  # of the first and the second corner, in steps of 1/65535
+    instance: int  # -1: the triangle is not instanced
+    weights: wp.uint32  # barycentric weights of the first and the second corner, in steps of 1/65535
 
 
 @wp.struct
 class GBuffer:
-    """One row per pixel, the top left first; in the scene's device frame."""
+    """What the camera sees and how it is lit: one row per pixel, row by row from the top left, in the device frame."""
 
     mesh: wp.array[wp.int32]  # index into Scene.meshes; -1: background
-    position: wp.array[wp.vec3]  # off the (smooth) surface, where shadow rays start
-    normal_or_direct: wp.array[wp.vec3]  # geometric normal (or the smooth surface's): light comes from its side alone;
+    position: wp.array[wp.vec3]  # off the (smooth) surface: where shadow rays start
+    normal_or_direct: wp.array[wp.vec3]  # the normal that bounds the lit side, geometric or of the smooth surface;
     # the estimator replaces it by the direct irradiance over π, which needs no memory of its own
-    indirect: wp.array[wp.vec3]  # irradiance over π by way of surfaces, from the estimator
+    indirect: wp.array[wp.vec3]  # irradiance over π from VPLs on surfaces or by further bounces, from the estimator
     shading_normal: wp.array[wp.vec3]
-    smooth_normal: wp.array[wp.vec3]  # the same without normal maps: by it surfaces are told apart
+    smooth_normal: wp.array[wp.vec3]  # the shading normal without normal maps: the filter tells surfaces apart by it
     albedo: wp.array[wp.vec3]
-    emission: wp.array[wp.vec3]  # radiance that reaches the camera without reflection; empty: there can be none
-    depth: wp.array[wp.float32]  # along the camera's -Z
-    surface_point: wp.array[SurfacePoint]  # no rows if no surface moves while the shutter is open
-    tiles: Tiles  # the pixels that are looked through; rows of others are of no meaning
+    emission: wp.array[wp.vec3]  # radiance that reaches the camera unreflected; empty: nothing in view can emit
+    depth: wp.array[wp.float32]  # distance along the camera's -Z
+    surface_point: wp.array[SurfacePoint]  # empty if no surface moves while the shutter is open
+    tiles: Tiles  # the pixels of this iteration; the rows of other pixels are undefined
 
 
 @wp.struct
 class Ray:
-    """A camera ray; `direction` has length 1 along the camera's -Z, so that t is depth."""
+    """A camera ray. Its `direction` has length 1 along the camera's -Z, so that the ray parameter t is the depth."""
 
     origin: wp.vec3
     direction: wp.vec3
@@ -62,7 +60,7 @@ class Ray:
 def camera_ray(camera: CameraData, pixel: int, u: wp.vec2, lens: wp.vec2) -> Ray:
     """The ray through the point `u` in [0, 1]² of a pixel of the film, from the point `lens` of the unit disk.
 
-    (0, 0) is the top left of the pixel; rays through one point of the film meet where the camera is in focus.
+    (0, 0) is the top left of the pixel. All rays through one point of the film meet at the focus distance.
     """
     x = (float(camera.first_column + pixel % camera.columns) + u[0]) / float(camera.image_columns)
     y = (float(camera.first_row + pixel // camera.columns) + u[1]) / float(camera.image_rows)
@@ -74,35 +72,35 @@ def camera_ray(camera: CameraData, pixel: int, u: wp.vec2, lens: wp.vec2) -> Ray
         ray.origin = camera.origin + on_film
         ray.direction = -camera.back
     else:
-        aside = (lens[0] * camera.right + lens[1] * camera.up) * camera.lens_radius
-        ray.origin = camera.origin + aside
-        ray.direction = on_film - camera.back - aside / camera.focus_distance
+        lens_offset = (lens[0] * camera.right + lens[1] * camera.up) * camera.lens_radius
+        ray.origin = camera.origin + lens_offset
+        ray.direction = on_film - camera.back - lens_offset / camera.focus_distance
     return ray
 
 
 @wp.func
 def project(camera: CameraData, position: wp.vec3) -> wp.vec2:
-    """Where on the film, in pixels, the middle of the lens sees a point; far outside if it is not before the camera."""
-    apart = position - camera.origin
-    depth = wp.where(camera.orthographic == 1, 1.0, -wp.dot(apart, camera.back))
+    """The place on the film [pixels] at which the centre of the lens sees a point; far outside if it is behind it."""
+    to_point = position - camera.origin
+    depth = wp.where(camera.orthographic == 1, 1.0, -wp.dot(to_point, camera.back))
     if depth <= 0.0:
         return wp.vec2(-_FARTHEST, -_FARTHEST)
-    x = (wp.dot(apart, camera.right) / depth - camera.left) / camera.width
-    y = 1.0 - (wp.dot(apart, camera.up) / depth - camera.bottom) / camera.height
+    x = (wp.dot(to_point, camera.right) / depth - camera.left) / camera.width
+    y = 1.0 - (wp.dot(to_point, camera.up) / depth - camera.bottom) / camera.height
     on_image = wp.vec2(x * float(camera.image_columns), y * float(camera.image_rows))
     return on_image - wp.vec2(float(camera.first_column), float(camera.first_row))
 
 
 @wp.func
 def image_pixel(camera: CameraData, pixel: int) -> int:
-    """Number of a pixel of the film in the whole image: what its random numbers depend on, wherever it is cut."""
+    """Index of a pixel of the film in the whole image. Its samples depend on it, so a crop has the same pixels."""
     column = camera.first_column + pixel % camera.columns
     return (camera.first_row + pixel // camera.columns) * camera.image_columns + column
 
 
 @wp.struct
 class CameraHit:
-    """What a camera ray meets; `mesh` is -1 for the background."""
+    """The surface that a camera ray hits; `mesh` is -1 for the background."""
 
     mesh: int
     position: wp.vec3
@@ -112,12 +110,12 @@ class CameraHit:
     albedo: wp.vec3
     emission: wp.vec3
     depth: float
-    hit: Hit  # what the rest was made of
+    hit: Hit  # from which the other fields were computed
 
 
 @wp.func
 def surface_point_of(hit: Hit) -> SurfacePoint:
-    """Where a hit is on its triangle."""
+    """The hit point by its barycentric coordinates."""
     out = SurfacePoint()
     out.triangle = hit.triangle
     out.instance = hit.instance
@@ -129,19 +127,19 @@ def surface_point_of(hit: Hit) -> SurfacePoint:
 
 @wp.func
 def _clip_interval(camera: CameraData, ray: Ray) -> wp.vec2:
-    """Nearest and farthest depth at which a camera ray sees anything; the same if it does not at all."""
+    """The interval of depths between the clipping range and planes; its ends are equal if it is empty."""
     near = camera.near
     far = camera.far
     for k in range(camera.plane_count):
         plane = camera.planes[k]
         n = wp.vec3(plane[0], plane[1], plane[2])
-        above = wp.dot(n, ray.origin - camera.origin) + plane[3]
-        rise = wp.dot(n, ray.direction)
-        if rise > 0.0:
-            near = wp.max(near, -above / rise)
-        elif rise < 0.0:
-            far = wp.min(far, -above / rise)
-        elif above < 0.0:
+        distance = wp.dot(n, ray.origin - camera.origin) + plane[3]
+        slope = wp.dot(n, ray.direction)
+        if slope > 0.0:
+            near = wp.max(near, -distance / slope)
+        elif slope < 0.0:
+            far = wp.min(far, -distance / slope)
+        elif distance < 0.0:
             far = near
     if near >= far or near > _FARTHEST:
         return wp.vec2(camera.near, camera.near)
@@ -150,37 +148,39 @@ def _clip_interval(camera: CameraData, ray: Ray) -> wp.vec2:
 
 @wp.func
 def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHit:
-    """Follows a camera ray."""
-    span = _clip_interval(camera, ray)
-    near = span[0]
+    """Traces a camera ray, and evaluates the surface that it hits."""
+    interval = _clip_interval(camera, ray)
+    near = interval[0]
     origin = ray.origin + ray.direction * near
-    reach = span[1] - near
-    hit = closest(scene, origin, ray.direction, reach)
+    t_max = interval[1] - near
+    hit = closest(scene, origin, ray.direction, t_max)
     length = wp.length(ray.direction)
-    towards = ray.direction / length
-    sight = CameraHit()
-    sight.mesh = -1
+    direction_unit = ray.direction / length
+    hit_record = CameraHit()
+    hit_record.mesh = -1
     if hit.triangle >= 0:
-        sight.hit = hit
-        sight.mesh = scene.triangle_mesh[hit.triangle]
-        sight.position = hit.position
-        sight.normal = hit.normal
-        sight.shading_normal = shading_normal(scene, hit)
-        rise = terminator_offset(scene, hit)
-        if wp.length_sq(rise) > 0.0:
-            sight.position += rise
-            sight.normal = sight.shading_normal
-        sight.depth = hit.t + near
+        hit_record.hit = hit
+        hit_record.mesh = scene.triangle_mesh[hit.triangle]
+        hit_record.position = hit.position
+        hit_record.normal = hit.normal
+        hit_record.shading_normal = shading_normal(scene, hit)
+        offset = terminator_offset(scene, hit)
+        if wp.length_sq(offset) > 0.0:
+            hit_record.position += offset
+            hit_record.normal = hit_record.shading_normal
+        hit_record.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
-        pixel *= wp.where(camera.orthographic == 1, 1.0, sight.depth)
-        sight.smooth_normal = sight.shading_normal
-        sight.shading_normal = mapped_normal(scene, hit, sight.smooth_normal, pixel)
-        sight.albedo = albedo(scene, hit, pixel)
-        sight.emission = emission_to_camera(scene, hit, towards, pixel)
-        reach = hit.t
+        pixel *= wp.where(camera.orthographic == 1, 1.0, hit_record.depth)
+        hit_record.smooth_normal = hit_record.shading_normal
+        hit_record.shading_normal = mapped_normal(scene, hit, hit_record.smooth_normal, pixel)
+        hit_record.albedo = albedo(scene, hit, pixel)
+        hit_record.emission = emission_to_camera(scene, hit, direction_unit, pixel)
+        t_max = hit.t
     if camera.visible_lights == 1:
-        sight.emission += intersect_lights(scene, origin, towards, reach * length, sight.mesh < 0, -1.0, -1)
-    return sight
+        hit_record.emission += intersect_lights(
+            scene, origin, direction_unit, t_max * length, hit_record.mesh < 0, -1.0, -1
+        )
+    return hit_record
 
 
 @wp.func
@@ -191,13 +191,13 @@ def _jitter_scramble(camera: CameraData, pixel: int, seed: wp.uint32) -> wp.uint
 
 @wp.func
 def jitter(scene: SceneData, camera: CameraData, pixel: int, iteration: int, seed: wp.uint32) -> wp.vec2:
-    """Where in a pixel an iteration looks, in [0, 1)²."""
+    """The point of a pixel that an iteration samples, in [0, 1)²."""
     return sobol.sample_2d(scene.sobol, iteration, 0, _jitter_scramble(camera, pixel, seed))
 
 
 @wp.func
 def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int, seed: wp.uint32) -> wp.vec2:
-    """Where on the lens, in the unit disk, an iteration's ray through a pixel starts."""
+    """The point of the lens, in the unit disk, from which an iteration's ray through a pixel starts."""
     if camera.lens_radius <= 0.0:
         return wp.vec2(0.0, 0.0)
     return square_to_disk(sobol.sample_2d(scene.sobol, iteration, 2, _jitter_scramble(camera, pixel, seed)))
@@ -207,29 +207,29 @@ def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int,
 def _trace_primary(
     first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
 ) -> None:
-    """One camera ray and what it meets."""
+    """Traces one camera ray; iteration -1 goes through the centre of the pixel and of the lens."""
     index = first + wp.tid()
     pixel = pixel_at(gbuffer.tiles, index)
     if pixel < 0:
         return
-    place = wp.vec2(0.5, 0.5)
+    u_pixel = wp.vec2(0.5, 0.5)
     lens = wp.vec2(0.0, 0.0)
     if iteration >= 0:
-        sample = iteration - skipped_iterations(gbuffer.tiles, index)  # a pixel leaves out no point of its sequence
-        place = jitter(scene, camera, pixel, sample, seed)
+        sample = iteration - skipped_iterations(gbuffer.tiles, index)  # a pixel uses all points of its sequence in turn
+        u_pixel = jitter(scene, camera, pixel, sample, seed)
         lens = lens_point(scene, camera, pixel, sample, seed)
-    sight = trace_camera_ray(scene, camera, camera_ray(camera, pixel, place, lens))
-    gbuffer.mesh[pixel] = sight.mesh
-    gbuffer.position[pixel] = sight.position
-    gbuffer.normal_or_direct[pixel] = sight.normal
-    gbuffer.smooth_normal[pixel] = sight.smooth_normal
-    gbuffer.shading_normal[pixel] = sight.shading_normal  # the same array, if there are no maps
-    gbuffer.albedo[pixel] = sight.albedo
+    hit_record = trace_camera_ray(scene, camera, camera_ray(camera, pixel, u_pixel, lens))
+    gbuffer.mesh[pixel] = hit_record.mesh
+    gbuffer.position[pixel] = hit_record.position
+    gbuffer.normal_or_direct[pixel] = hit_record.normal
+    gbuffer.smooth_normal[pixel] = hit_record.smooth_normal
+    gbuffer.shading_normal[pixel] = hit_record.shading_normal  # the same array if there are no normal maps
+    gbuffer.albedo[pixel] = hit_record.albedo
     if gbuffer.emission.shape[0] > 0:
-        gbuffer.emission[pixel] = sight.emission
-    gbuffer.depth[pixel] = sight.depth
+        gbuffer.emission[pixel] = hit_record.emission
+    gbuffer.depth[pixel] = hit_record.depth
     if gbuffer.surface_point.shape[0] > 0:
-        gbuffer.surface_point[pixel] = surface_point_of(sight.hit)
+        gbuffer.surface_point[pixel] = surface_point_of(hit_record.hit)
 
 
 @wp.func
@@ -292,14 +292,14 @@ def new_gbuffer(
 
 def trace_primary(
     scene: DeviceScene,
-    camera: Any,
+    camera: CameraData,
     launcher: Launcher,
-    gbuffer: Any,
+    gbuffer: GBuffer,
     *,
     iteration: int,
     seed: int,
 ) -> None:
-    """Fills the tiles of the G-buffer with what the camera sees in one iteration; in -1 through the pixels' centres."""
+    """Fills the tiles of the G-buffer with what the camera sees in one iteration; -1: through the pixels' centres."""
     count = indices(gbuffer.tiles)
     launcher.launch(_trace_primary, count, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
     launcher.profile.counts["primary_rays"] += gbuffer.tiles.pixels

@@ -1,4 +1,4 @@
-"""What the user can choose about a render: one frozen, validated record. The CLI's flags come from it."""
+"""The settings of a render: one frozen, validated record. The flags of the command line are made from its fields."""
 
 import dataclasses
 import math
@@ -9,10 +9,10 @@ from warp_ir.image.color_space import COLOR_SPACES, REC709
 from warp_ir.scene import CONFORM_POLICIES, InputError
 
 ESTIMATOR_NAMES = ("vpl", "keller", "path")
-"""In the order in which help texts list them; the first is the default."""
+"""Names of the estimators in the order of help texts; the first is the default."""
 ABSORPTION_NAMES = ("roulette", "fractional")
 MAX_PIXELS = 1 << 28
-"""Above this an image is refused on any machine; below, it depends on the memory there is."""
+"""Largest number of pixels of a picture on any machine; the available memory may allow less."""
 UNLIMITED = 2**31 - 1
 """`ResolvedSettings.max_bounces` where there is no limit: more than there can be."""
 
@@ -24,20 +24,20 @@ def _setting(default: Any, doc: str, choices: tuple[str, ...] = ()) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How to render. Every value is checked on construction; `InputError` names the field."""
+    """The settings of a render. Every value is checked on construction; an `InputError` names the field."""
 
-    width: int = _setting(512, "width of the picture in pixels")
-    height: int | None = _setting(None, "height in pixels; by default from the camera's aspect")
+    width: int = _setting(512, "width of the picture [pixels]")
+    height: int | None = _setting(None, "height of the picture [pixels]; by default from the camera's aspect")
     pixel_aspect: float = _setting(1.0, "width of a pixel over its height")
     conform: str = _setting(
-        CONFORM_POLICIES[0], "what happens to the camera's window if its aspect is not the picture's", CONFORM_POLICIES
+        CONFORM_POLICIES[0], "how the camera's window is fitted to a picture of another aspect", CONFORM_POLICIES
     )
     data_window: tuple[float, float, float, float] = _setting(
         (0.0, 0.0, 1.0, 1.0),
-        "part of the picture to render: left, bottom, right and top, where 0 0 1 1 is all of it; only pixels whose"
-        " centre lies inside, and an .exr tells where they belong",
+        "part of the picture to render: left, bottom, right and top, where 0 0 1 1 is the whole picture; pixels whose"
+        " centre lies inside are rendered, and an .exr file stores their place in the picture",
     )
-    depth_of_field: bool = _setting(True, "blur what is out of the camera's focus, if it has an f-stop")
+    depth_of_field: bool = _setting(True, "blur what is out of focus, if the camera has an f-stop")
     motion_blur: bool = _setting(True, "blur what moves while the camera's shutter is open")
     iterations: int | None = _setting(None, "stop after this many iterations (64 if no other limit is given)")
     time_limit: float | None = _setting(None, "stop after this many seconds of rendering")
@@ -48,11 +48,13 @@ class RenderSettings:
     )
     light_paths: int | None = _setting(
         None,
-        "light paths per iteration, a power of two is best; by default 512 for keller, for vpl 1024 to 4096 by the"
-        " number of pixels",
+        "light paths per iteration; a power of two is best; by default 512 for keller, and for vpl 1024 to 4096"
+        " depending on the number of pixels",
     )
     max_bounces: int | None = _setting(
-        None, "longest chain of reflections: 0 = direct light only, 1 = one more, ...; unlimited by default"
+        None,
+        "largest number of indirect bounces: 0 = direct light only, 1 = one bounce of indirect light, ...; by default"
+        " there is no limit",
     )
     estimator: str = _setting(ESTIMATOR_NAMES[0], "which algorithm computes the light", ESTIMATOR_NAMES)
     absorption: str | None = _setting(
@@ -65,8 +67,10 @@ class RenderSettings:
         "keller only: bound the geometry term at 1/(R·extent)², R being this fraction of the scene's extent;"
         " darkens corners; 0 = unbounded",
     )
-    filter: bool = _setting(True, "vpl only: filter the noise that is left; off, the picture is the unbiased mean")
-    denoise: bool = _setting(False, "average the filtered picture with one by Open Image Denoise (extra 'denoise')")
+    filter: bool = _setting(
+        True, "vpl only: filter the remaining noise; without the filter the picture is the unbiased mean"
+    )
+    denoise: bool = _setting(False, "average the filtered picture with that of Open Image Denoise (extra 'denoise')")
     visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
     color_space: str = _setting(
         REC709,

@@ -1,9 +1,7 @@
-"""Squares of 8 x 8 pixels, one after the other: the order in which pixels are worked on, and the parts that are done.
+"""Tiles of 8 x 8 pixels: the order in which pixels are processed, and the parts that adaptive sampling selects.
 
-Pixels of a square see about the same: neighbours in space are neighbours in time, and in a group of GPU threads.
+Pixels of a tile see similar things, so their rays are coherent, in the caches of a CPU as in a warp of GPU threads.
 """
-
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,23 +12,23 @@ from warp_ir.device.launcher import Launcher
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 TILE = 8
-"""Pixels to its side."""
+"""Edge length of a tile [pixels]."""
 
 
 @wp.struct
 class Tiles:
-    """Some of the tiles of a film."""
+    """A selection of the tiles of a film."""
 
-    columns: int  # of the film, in pixels
+    columns: int  # size of the film [pixels]
     rows: int
-    pixels: int  # in these tiles
-    numbers: wp.array[wp.int32]  # row by row; those at the right and at the bottom may reach beyond the film
-    skipped: wp.array[wp.int32]  # iterations so far that were not for a tile, of all tiles of the film
+    pixels: int  # number of pixels in the selected tiles
+    numbers: wp.array[wp.int32]  # the selected tiles, counted row by row; those at the border may be cut by it
+    skipped: wp.array[wp.int32]  # [all tiles], number of iterations so far that left out the tile
 
 
 @wp.func
 def pixel_of_tile(tiles: Tiles, tile: int, k: int) -> int:
-    """The k-th of the 64 pixels of a tile; -1 beyond the film."""
+    """The k-th of the 64 pixels of a tile; -1 outside the film."""
     across = (tiles.columns + TILE - 1) // TILE
     column = (tile % across) * TILE + k % TILE
     row = (tile // across) * TILE + k // TILE
@@ -41,26 +39,26 @@ def pixel_of_tile(tiles: Tiles, tile: int, k: int) -> int:
 
 @wp.func
 def pixel_at(tiles: Tiles, index: int) -> int:
-    """The pixel that an index stands for, out of `indices`; -1: none."""
+    """The pixel of an index of a launch over `indices`; -1: there is none."""
     return pixel_of_tile(tiles, tiles.numbers[index // (TILE * TILE)], index % (TILE * TILE))
 
 
 @wp.func
 def skipped_iterations(tiles: Tiles, index: int) -> int:
-    """How many iterations so far were not for that pixel."""
+    """Number of iterations so far that left out the pixel of an index."""
     return int(tiles.skipped[tiles.numbers[index // (TILE * TILE)]])
 
 
-def all_tiles(columns: int, rows: int, launcher: Launcher) -> Any:
-    """The `Tiles` of a film of so many pixels, none of which has been left out."""
+def all_tiles(columns: int, rows: int, launcher: Launcher) -> Tiles:
+    """All tiles of a film, none of which has been left out so far."""
     count = tile_count(columns, rows)
     return some_tiles(np.ones(count, bool), np.zeros(count, np.int32), columns, rows, launcher)
 
 
 def some_tiles(
     which: npt.NDArray[np.bool_], skipped: npt.NDArray[np.int32], columns: int, rows: int, launcher: Launcher
-) -> Any:
-    """Those `Tiles` for which `which` [tiles] is true; `skipped` [tiles] are iterations that have left one out."""
+) -> Tiles:
+    """The tiles selected by `which` [tiles]; `skipped` [tiles] counts the iterations that left out each tile."""
     tiles = Tiles()
     tiles.columns, tiles.rows = columns, rows
     tiles.numbers, tiles.skipped = launcher.array(np.flatnonzero(which), wp.int32), launcher.array(skipped, wp.int32)
@@ -70,10 +68,10 @@ def some_tiles(
 
 
 def tile_count(columns: int, rows: int) -> int:
-    """How many tiles cover a film."""
+    """Number of tiles that cover a film."""
     return -(-columns // TILE) * -(-rows // TILE)
 
 
-def indices(tiles: Any) -> int:
-    """How many indices a kernel runs over for some `Tiles`: those of whole ones."""
+def indices(tiles: Tiles) -> int:
+    """Number of indices of a launch over some tiles: 64 for each, even where the film cuts it."""
     return int(tiles.numbers.shape[0]) * TILE * TILE

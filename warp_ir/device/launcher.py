@@ -1,11 +1,11 @@
-"""How kernels run: on all CPU cores with the same bits whatever their number, or on a CUDA device.
+"""How kernels run: on all CPU cores, with the same bits on any number of them, or on a CUDA device.
 
-A Warp launch on the CPU is single-threaded but releases the GIL, so a launch is cut into bands of
-indices that Python threads take in turn. The convention that makes this possible: the first argument
-of every kernel of this package is ``first: int``, and its index is ``first + wp.tid()``. Kernels write
-only what their index owns, so the cut cannot be seen in the result.
+A Warp launch on the CPU is single-threaded but releases the GIL, so a launch is divided into bands of indices, and
+Python threads take one band after the other. A convention makes this possible: the first argument of every kernel of
+this package is ``first: int``, and its index is ``first + wp.tid()``. Kernels write only what their index owns, so the
+result does not depend on the bands.
 
-What is short, or done on the host, keeps one thread busy: `Launcher.overlap` gives the others something to do.
+Short launches, and work on the host, keep only one thread busy. `Launcher.overlap` gives the others something to do.
 """
 
 import math
@@ -15,47 +15,53 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
 
 from warp_ir.device.profiling import Profile
 from warp_ir.scene import InputError
 
-_MOST_OF_A_LAUNCH = 16
-"""No band is a larger part of a launch than this, so that Ctrl-C need not wait for long."""
-_MOST_BANDS = 64
-"""Per thread."""
-_LEAST_SECONDS = 1.0e-4
-"""What a band should take at least: taking one costs 5 microseconds."""
+_MIN_BANDS = 16
+"""Least number of bands of a launch, so that Ctrl-C need not wait for long."""
+_MAX_BANDS_PER_THREAD = 64
+"""Largest number of bands of a launch, per thread."""
+_MIN_BAND_SECONDS = 1.0e-4
+"""Least duration of a band [s]: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
 MAX_REGISTERS = 168
-"""Of a CUDA thread, in kernels that trace rays. Left alone they take 255, and a multiprocessor has room for 256 threads
-to hide each other's waiting; so it has for 384. What does not fit is kept in memory, mostly by callers while rays are
-followed. The number is what Blender's Cycles uses (kernel/device/cuda/config.h); here it has not been measured yet."""
+"""Registers of a CUDA thread in kernels that trace rays. Without a limit the compiler takes 255, and a multiprocessor
+holds 256 threads; with this limit it holds 384, which hide each other's latencies better. What does not fit is spilled
+to local memory, mostly by callers during traversal. The number is that of Blender's Cycles
+(kernel/device/cuda/config.h); it has not been measured here yet."""
+
+
+Record = TypeVar("Record")
 
 
 class Cancelled(Exception):
     """The work in flight was abandoned because `Launcher.cancel` was called."""
 
 
-class _Work:
-    """A launch under way on the CPU. What changes does so under the launcher's lock."""
+class _Launch:
+    """A launch in progress on the CPU. Its fields change only under the launcher's lock."""
 
-    def __init__(self, kernel: Any, count: int, inputs: Sequence[Any], phase: str | None, whole: bool) -> None:
+    def __init__(
+        self, kernel: Any, count: int, inputs: Sequence[Any], phase: str | None, uninterruptible: bool
+    ) -> None:
         self.kernel, self.count, self.inputs = kernel, count, inputs
-        self.phase = phase  # which its seconds go to; None: that of the thread that waits for it
-        self.whole = whole  # cancelling does not touch it
-        self.least = 1  # indices of a band
-        self.taken = 0
-        self.run = 0
+        self.phase = phase  # that its time is added to; None: the phase of the thread that waits for it
+        self.uninterruptible = uninterruptible  # `cancel` does not affect it
+        self.min_band = 1  # least number of indices in a band
+        self.indices_taken = 0
+        self.indices_run = 0
         self.commands: list[Any] = []  # recorded launches that no thread is using
         self.done = threading.Event()
         self.error: BaseException | None = None
 
 
 class Launcher:
-    """Runs kernels on one device, and measures them by phase. One thread may use it; it uses others itself."""
+    """Runs kernels on one device, and times them by phase. Only one thread may call it; it uses others internally."""
 
     def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
         """Opens the device.
@@ -73,26 +79,26 @@ class Launcher:
             known = ", ".join(str(d) for d in wp.get_devices())
             raise InputError(f"device {device!r} is not available; available: {known}") from error
         self.profile = Profile(self.device)
-        self.waits = self.device.is_cpu
-        """Whether launches are done when they return, so that the host may read what they have written."""
+        self.synchronous = self.device.is_cpu
+        """Whether a launch has finished when the call returns: then the host reads results without waiting."""
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self._lock = threading.Lock()
         self._loader: ThreadPoolExecutor | None = None
         self._loading: dict[Any, Future[Any]] = {}  # by Warp's module
-        self._open: list[_Work] = []  # the latest is the most urgent
-        self._helpers = 0  # threads of the pool that look for bands
-        self._pace: dict[Any, float] = {}  # seconds per index of a kernel, as last seen
+        self._open: list[_Launch] = []  # launches with bands left; the latest is the most urgent
+        self._helper_count = 0  # threads of the pool that are running bands
+        self._seconds_per_index: dict[Any, float] = {}  # of each kernel, as last measured
         self._phase: str | None = None  # the one being timed
-        self._beside: str | None = None  # phase of the launches that nobody waits for
-        self._whole = False
+        self._overlap_phase: str | None = None  # phase of launches that are overlapped; None: launches are waited for
+        self._uninterruptible = False
         self._cancelled = threading.Event()
 
     def load(self, modules: Sequence[Any]) -> None:
-        """Compiles (or fetches from the kernel cache) every kernel of the given Python modules, several at a time.
+        """Compiles every kernel of the given Python modules, or loads it from the kernel cache, several at a time.
 
-        Their order is that in which they are begun: those that take longest should come first. Inside `loading` it
-        returns before they are there, unless the device is a GPU.
+        Modules are begun in the given order: those that take longest should come first. Inside `loading`, the call
+        returns before they are loaded, unless the device is a GPU.
         """
         if self._loader is None:
             with self.loading():
@@ -101,12 +107,12 @@ class Launcher:
         for m in modules:
             load = self._loader.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM)
             self._loading[wp.get_module(m.__name__)] = load
-        if self.device.is_cuda:  # nothing is uploaded meanwhile
+        if self.device.is_cuda:  # uploading does not overlap with compiling there
             self._wait_for(*self._loading)
 
     @contextmanager
     def loading(self) -> Iterator[None]:
-        """Modules are compiled while the block runs, and are there when it ends; a launch waits for its own."""
+        """Modules are compiled while the block runs, and are loaded when it ends; a launch waits for its own module."""
         with ThreadPoolExecutor(self.threads if self.device.is_cpu else _usable_cores()) as self._loader:
             try:
                 yield
@@ -117,7 +123,7 @@ class Launcher:
                 self._loading.clear()
 
     def _wait_for(self, *modules: Any) -> None:
-        """Waits until Warp's modules are there, as far as they are being loaded."""
+        """Waits for those of Warp's modules that are being loaded."""
         for module in modules:
             if module in self._loading:
                 start = time.perf_counter()
@@ -133,7 +139,7 @@ class Launcher:
         Raises:
             Cancelled: `cancel` was called before all of it had run.
         """
-        if self._cancelled.is_set() and not self._whole:
+        if self._cancelled.is_set() and not self._uninterruptible:
             raise Cancelled
         if count <= 0:
             return
@@ -141,26 +147,32 @@ class Launcher:
         if self.device.is_cuda:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
-        work = _Work(kernel, count, inputs, self._beside, self._whole)
-        work.commands.append(self._record(work))  # here, where the module is loaded if it has not been
-        pace = self._pace.get(kernel)
-        even = count // (_MOST_OF_A_LAUNCH * self.threads)
-        work.least = max(count // (_MOST_BANDS * self.threads), even if pace is None else int(_LEAST_SECONDS / pace), 1)
+        launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)
+        launch.commands.append(self._record_command(launch))  # in this thread, which loads the module if necessary
+        per_index = self._seconds_per_index.get(kernel)
+        even = count // (_MIN_BANDS * self.threads)
+        launch.min_band = max(
+            count // (_MAX_BANDS_PER_THREAD * self.threads),
+            even if per_index is None else int(_MIN_BAND_SECONDS / per_index),
+            1,
+        )
         with self._lock:
-            self._open.append(work)
-            wanted = min(self.threads - 1 - self._helpers, -(-count // work.least) - (self._beside is None))
-            self._helpers += max(wanted, 0)
-        for _ in range(wanted):
-            self._pool.submit(self._help)  # type: ignore[union-attr]
-        if self._beside is None:
-            self._finish([work])
+            self._open.append(launch)
+            helpers = min(
+                self.threads - 1 - self._helper_count, -(-count // launch.min_band) - (self._overlap_phase is None)
+            )
+            self._helper_count += max(helpers, 0)
+        for _ in range(helpers):
+            self._pool.submit(self._run_open_launches)  # type: ignore[union-attr]
+        if self._overlap_phase is None:
+            self._wait_for_launches([launch])
 
     @contextmanager
     def overlap(self, phase: str, start: Callable[[], None]) -> Iterator[None]:
-        """What `start` launches is run by whoever is free while the block runs, and done when the block ends.
+        """Overlaps the launches of `start` with the block: idle threads run them, and they are done when it ends.
 
-        Its launches must not depend on each other nor on what the block does, nor the other way round. On CUDA they
-        just come first. Their time goes to `phase`, and not to the phases in the block.
+        The launches must not depend on each other, nor on the block, nor the block on them. On CUDA they run first.
+        Their time is added to `phase`, and not to the phases inside the block.
         """
         if self.device.is_cuda:
             with self.phase(phase):
@@ -169,107 +181,107 @@ class Launcher:
             return
         mark = len(self._open)
         try:
-            self._beside = phase
+            self._overlap_phase = phase
             try:
                 start()
             finally:
-                self._beside = None
+                self._overlap_phase = None
             yield
         finally:
-            self._finish(self._open[mark:])
+            self._wait_for_launches(self._open[mark:])
 
     @contextmanager
     def uninterruptible(self) -> Iterator[None]:
-        """`cancel` does not touch the launches inside: for what must be done entirely or not at all."""
-        self._whole = True
+        """`cancel` does not affect the launches inside: for work that must be done completely or not at all."""
+        self._uninterruptible = True
         try:
             yield
         finally:
-            self._whole = False
+            self._uninterruptible = False
 
-    def _record(self, work: _Work) -> Any:
-        return wp.launch(work.kernel, dim=1, inputs=[0, *work.inputs], device=self.device, record_cmd=True)
+    def _record_command(self, launch: _Launch) -> Any:
+        return wp.launch(launch.kernel, dim=1, inputs=[0, *launch.inputs], device=self.device, record_cmd=True)
 
-    def _finish(self, works: Sequence[_Work]) -> None:
-        """Helps until some launches are done."""
+    def _wait_for_launches(self, launches: Sequence[_Launch]) -> None:
+        """Runs bands until some launches are done."""
         try:
-            for work in works:
-                while band := self._take(work):
-                    self._run(*band)
-                while not work.done.is_set():  # another thread is at it: there may be something else to do
-                    if band := self._take():
-                        self._run(*band)
+            for launch in launches:
+                while band := self._take_band(launch):
+                    self._run_band(*band)
+                while not launch.done.is_set():  # another thread runs its last band; meanwhile this one runs others
+                    if band := self._take_band():
+                        self._run_band(*band)
                     else:
-                        work.done.wait()
+                        launch.done.wait()
         finally:
             with self._lock:
-                self._open = [work for work in self._open if work not in works]
-        for work in works:
-            if work.error is not None:
-                raise work.error
-        if self._cancelled.is_set() and not all(work.whole for work in works):
+                self._open = [launch for launch in self._open if launch not in launches]
+        for launch in launches:
+            if launch.error is not None:
+                raise launch.error
+        if self._cancelled.is_set() and not all(launch.uninterruptible for launch in launches):
             raise Cancelled
 
-    def _help(self) -> None:
-        """Runs bands of whatever is open, in a thread of the pool."""
-        while band := self._take(helper=True):
-            self._run(*band)
+    def _run_open_launches(self) -> None:
+        """Runs bands of any open launch, in a thread of the pool."""
+        while band := self._take_band(helper=True):
+            self._run_band(*band)
 
-    def _take(self, work: _Work | None = None, helper: bool = False) -> tuple[_Work, int, int, Any] | None:
-        """The next band of a launch, of the latest that has one left by default, and a command if one is recorded.
+    def _take_band(self, launch: _Launch | None = None, helper: bool = False) -> tuple[_Launch, int, int, Any] | None:
+        """The next band of a launch, by default of the latest that has one, and a recorded command if there is one.
 
-        Bands become smaller towards the end, so that all threads come to it at once.
+        Bands become smaller towards the end of a launch, so that all threads finish at about the same time.
         """
         with self._lock:
-            for each in reversed(self._open) if work is None else [work]:
-                left = each.count - each.taken
+            for each in reversed(self._open) if launch is None else [launch]:
+                left = each.count - each.indices_taken
                 if left > 0:
-                    size = each.count // _MOST_OF_A_LAUNCH
+                    size = each.count // _MIN_BANDS
                     if self.threads > 1:
                         size = min(size, left // (2 * self.threads))
-                    begin = each.taken
-                    each.taken += min(max(size, each.least), left)
-                    return each, begin, each.taken, each.commands.pop() if each.commands else None
-            self._helpers -= helper
+                    begin = each.indices_taken
+                    each.indices_taken += min(max(size, each.min_band), left)
+                    return each, begin, each.indices_taken, each.commands.pop() if each.commands else None
+            self._helper_count -= helper
         return None
 
-    def _run(self, work: _Work, begin: int, end: int, command: Any) -> None:
-        """Runs a band, unless all is cancelled."""
+    def _run_band(self, launch: _Launch, begin: int, end: int, command: Any) -> None:
+        """Runs a band, unless its launch is cancelled."""
         start = time.perf_counter()
-        wanted = work.whole or not self._cancelled.is_set()
+        wanted = launch.uninterruptible or not self._cancelled.is_set()
         try:
             if wanted:
-                command = command or self._record(work)
+                command = command or self._record_command(launch)
                 command.set_param_at_index(0, begin)
                 command.set_dim(end - begin)
                 command.launch()
-        except BaseException as error:  # raised again by the thread that waits
-            work.error = error
+        except BaseException as error:  # raised again in the thread that waits
+            launch.error = error
         seconds = time.perf_counter() - start
         with self._lock:
             if wanted:
-                self._pace[work.kernel] = seconds / (end - begin)
+                self._seconds_per_index[launch.kernel] = seconds / (end - begin)
             if command is not None:
-                work.commands.append(command)
-            if work.phase is not None:
-                self.profile.add(work.phase, seconds / self.threads)
+                launch.commands.append(command)
+            if launch.phase is not None:
+                self.profile.add(launch.phase, seconds / self.threads)
                 if self._phase is not None:
                     self.profile.add(self._phase, -seconds / self.threads)
-            work.run += end - begin
-            if work.run == work.count:
-                work.done.set()
+            launch.indices_run += end - begin
+            if launch.indices_run == launch.count:
+                launch.done.set()
 
     def resume(self) -> None:
-        """Takes `cancel` back."""
+        """Ends the state that `cancel` began."""
         self._cancelled.clear()
 
     def cancel(self) -> None:
-        """Abandons the launches in flight as soon as may be; safe from a signal handler or another thread."""
+        """Abandons the launches in progress as soon as possible. Signal handlers and other threads may call it."""
         self._cancelled.set()
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Times what is launched inside under `name`."""
+        """Adds the time of the launches inside to the phase `name`."""
         outer, self._phase = self._phase, name
         try:
             with self.profile.phase(name):
@@ -278,7 +290,7 @@ class Launcher:
             self._phase = outer
 
     def memory(self) -> float:
-        """Bytes that may be allocated: what is free on a GPU, all there is on a CPU; infinity if unknown."""
+        """Bytes that may be allocated: the free memory of a GPU, the whole memory of a CPU; infinity if unknown."""
         if self.device.is_cuda:
             return float(self.device.free_memory)
         try:
@@ -290,12 +302,12 @@ class Launcher:
         """An uninitialised array on the device."""
         return wp.empty(shape, dtype=dtype, device=self.device)
 
-    def at_most(self, number: Any, limit: int) -> int:
-        """For how many rows to make room and to launch: a number on the device [1], or `limit` if that is less.
+    def row_count(self, number: Any, limit: int) -> int:
+        """Number of rows to allocate and to launch for, given the number on the device [1] and its upper limit.
 
-        That number itself if it can be had without waiting, else the limit: kernels have to look at the number, too.
+        The number itself where reading it does not wait, else the limit: then kernels must read the number themselves.
         """
-        return min(int(number.numpy()[0]), limit) if self.waits else limit
+        return min(int(number.numpy()[0]), limit) if self.synchronous else limit
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An array of zeros on the device."""
@@ -307,7 +319,7 @@ class Launcher:
 
 
 def partition(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
-    """Arrays of so many rows of each type, one after the other in a block of float32: memory that is used twice."""
+    """Divides a block of float32 into arrays of `rows` rows of each type: different arrays share the same memory."""
     arrays, begin = [], 0
     for dtype in dtypes:
         end = begin + rows * float_count(dtype)
@@ -316,17 +328,17 @@ def partition(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:
     return arrays
 
 
-def copy_record(record: Any) -> Any:
-    """Another `wp.struct` of the same kind and the same arrays."""
-    kind = record._cls
-    copy = kind()
+def copy_record(record: Record) -> Record:
+    """A copy of a `wp.struct` record that refers to the same arrays."""
+    kind = record._cls  # type: ignore[attr-defined]  # Warp's StructInstance
+    copy: Record = kind()
     for name in kind.vars:
         setattr(copy, name, getattr(record, name))
     return copy
 
 
 def float_count(*dtypes: Any) -> int:
-    """How many float32 a row of these types takes."""
+    """Number of float32 in a row of these types."""
     return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes) // 4
 
 

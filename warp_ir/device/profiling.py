@@ -1,4 +1,4 @@
-"""Where the time goes: seconds by phase, on the host's clock or the GPU's own."""
+"""Profiling: seconds by phase, by the clock of the host or of the GPU, and counts."""
 
 import time
 from collections import Counter, defaultdict
@@ -10,7 +10,7 @@ import warp as wp
 
 
 class Profile:
-    """Seconds and counts by name. On CUDA a phase is timed by events, so that nothing waits for it."""
+    """Seconds and counts by name. On CUDA, events time a phase, so that nothing waits for it."""
 
     def __init__(self, device: Any) -> None:
         """A profile of work on a Warp device."""
@@ -18,7 +18,7 @@ class Profile:
         self._seconds: dict[str, float] = defaultdict(float)
         self._pending: list[tuple[str, Any, Any]] = []
         self.counts: Counter[str] = Counter()
-        """How often things happened: rays, light paths, ...; add to it freely."""
+        """Counts of rays, light paths, ...; callers add to them."""
         self._tallies: dict[str, Any] = {}
 
     @contextmanager
@@ -44,28 +44,28 @@ class Profile:
         self._seconds[name] += seconds
 
     def tally(self, name: str) -> Any:
-        """A count on the device, int64 [1], for kernels to add to."""
+        """A count on the device, int64 [1], that kernels add to."""
         if name not in self._tallies:
             self._tallies[name] = wp.zeros(1, dtype=wp.int64, device=self._device)
         return self._tallies[name]
 
     def counted(self) -> dict[str, int]:
-        """`counts`, and those on the device. Waits for the GPU's pending work."""
+        """`counts` and the counts on the device. Waits for pending work of the GPU."""
         return {**self.counts, **{name: int(tally.numpy()[0]) for name, tally in self._tallies.items()}}
 
     def clear(self) -> None:
-        """Forgets all of it."""
+        """Sets all seconds and counts to zero."""
         self.seconds()
         self._seconds.clear()
         self.counts.clear()
         self._tallies.clear()
 
     def since(self, before: dict[str, float]) -> Counter[str]:
-        """Seconds by phase since `seconds` gave those `before`."""
+        """Seconds by phase since an earlier result of `seconds`, given as `before`."""
         return Counter({phase: max(s - before.get(phase, 0.0), 0.0) for phase, s in self.seconds().items()})
 
     def seconds(self) -> dict[str, float]:
-        """Seconds so far, by phase. Waits for the GPU's pending work."""
+        """Seconds so far, by phase. Waits for pending work of the GPU."""
         if self._pending:
             wp.synchronize_device(self._device)
             for name, begin, end in self._pending:

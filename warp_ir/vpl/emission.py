@@ -314,7 +314,7 @@ def emit_vpls(
     traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
     launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
-    vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.at_most(ends[paths - 1 : paths], settings.capacity))
+    vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.row_count(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
     launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
