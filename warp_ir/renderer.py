@@ -91,7 +91,11 @@ class Renderer:
         first = self._shutter[0]
         assert self._layout is not None
         film = Film(
-            first.camera.columns, first.camera.rows, self.launcher, first.scene.frame, glows=self._layout.emission
+            first.camera.columns,
+            first.camera.rows,
+            self.launcher,
+            first.scene.frame,
+            has_emission=self._layout.emission,
         )
         film.settings = self.settings
         if self._resolved.filter:
