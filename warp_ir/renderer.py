@@ -138,7 +138,7 @@ class Renderer:
                     spent = profile.since(before)
                     per_ray = spent["primary"] / (profile.counts["primary_rays"] - rays)
                     report = scheduler.update(
-                        reserve=self._picture_seconds(film, per_ray), fixed=spent["emission"] / spent.total()
+                        reserve=self._picture_seconds(film, per_ray), fixed_share=spent["emission"] / spent.total()
                     )
                 except Cancelled:
                     break
