@@ -215,8 +215,8 @@ class Film:
         if self.reconstruction is not None and self.iterations > 1:
             difference = self._filter_difference(self.reconstruction)
             noise, change = self._tile_errors(difference)[:, 2:].T
-            bias = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
-            tiles = bias.astype(np.float32).reshape(-(-self.height // TILE), -1)
+            bias_fraction = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
+            tiles = bias_fraction.astype(np.float32).reshape(-(-self.height // TILE), -1)
             pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: self.height, : self.width, None]
             error = np.hypot(error, difference * pixels)
         return np.where(n > 1, error, np.float32(np.inf))
