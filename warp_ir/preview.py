@@ -82,7 +82,7 @@ def picture_vpls(
     from vtkmodules.vtkCommonCore import vtkLogger
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    plotter = pyvista.Plotter(off_screen=True, window_size=[width, height], lighting="none")
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=[width, height], lighting="none")
     try:
         plotter.set_background(_BACKGROUND)
         camera = scene.camera.fit(width, height) if view == "camera" else _outside(scene, width / height)
@@ -148,7 +148,7 @@ def _add_meshes(plotter: "pyvista.Plotter", scene: Scene, camera: Camera, *, ope
             visible = np.einsum("nk,nk->n", outward, middle - center) < reach - 0.02 * span
         if not visible.any():
             continue
-        triangles = mesh.triangles[visible]
+        triangles: Any = mesh.triangles[visible]
         surface = pyvista.PolyData.from_regular_faces(mesh.points.astype(np.float64), triangles)
         surface.cell_data["shade"] = np.round(255.0 * shade[visible]).astype(np.uint8)
         plotter.add_mesh(surface, scalars="shade", rgb=True, lighting=False)

@@ -276,7 +276,7 @@ class Film:
         """
         shape = (self.height, self.width)
         if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 0:
-            return self._reconstruct(self.reconstruction)[("direct", "indirect").index(name)]
+            return np.asarray(self._reconstruct(self.reconstruction)[("direct", "indirect").index(name)])
         if name == "direct":
             return self._radiance_of("emission", "direct")
         if name == "indirect":

@@ -381,6 +381,8 @@ def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.ui
         raise InputError(f"{path}: cannot be written: no space left on the device")
     with whole_file(path) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
+        if writer is None:
+            raise OSError(_first_line(oiio.geterror()))
         # close() flushes, and geterror() tells of failures that the other calls do not report.
         good = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
         good = writer.close() and good

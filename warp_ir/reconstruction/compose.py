@@ -4,6 +4,8 @@ Away from edges, a pixel whose filtered value differs from the unfiltered mean b
 explains takes the mean. On edges, the difference is shrunk by its noise (James and Stein 1961) and added.
 """
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import MAX_REGISTERS, Launcher
@@ -227,3 +229,8 @@ def compose(
 def correct_edges(surfaces: PixelSurfaces, out: ResolvedPicture, launcher: Launcher) -> None:
     """Adds the bias of the pixels on edges to a `ResolvedPicture`."""
     launcher.launch(_correct_edges, surfaces.columns * surfaces.rows, [surfaces, out])
+
+
+def rows_to_host(out: ResolvedPicture) -> npt.NDArray[np.float32]:
+    """The rows of a `ResolvedPicture` on the host, float32 [2 or 5, pixels, 3]."""
+    return np.asarray(out.rows.numpy())

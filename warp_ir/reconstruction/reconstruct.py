@@ -13,7 +13,7 @@ from warp_ir.device.scratch import Scratch
 from warp_ir.film.accumulate import FilmData
 from warp_ir.gbuffer import GBuffer
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
-from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture
+from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture, rows_to_host
 from warp_ir.reconstruction.filter import filter_layer, new_layer
 from warp_ir.reconstruction.reprojection import (
     ShutterSample,
@@ -112,4 +112,4 @@ class Reconstruction:
             else:
                 compose(self._scene, camera, samples, layer, film, self._exposure, out, launcher)
             correct_edges(samples.surfaces, out, launcher)
-            return np.asarray(out.rows.numpy()).reshape(-1, camera.rows, camera.columns, 3)
+            return rows_to_host(out).reshape(-1, camera.rows, camera.columns, 3)
