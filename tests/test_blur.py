@@ -100,10 +100,11 @@ def test_blur_is_no_worse_than_its_samples(pictures):
 def test_no_sample_is_lost(what):
     """Every sample is for one pixel: as many are counted as were made on surfaces that reflect."""
     film = ir.render(SCENES[what](), replace(BLURRED, iterations=4))
-    seen = {name: array.numpy() for name, array in film.reconstruction.arrays().items()}
-    assert seen["count"].sum() + seen["other_count"].sum() == round(film.aov("alpha").sum() * film.iterations)
+    samples = {name: array.numpy() for name, array in film.reconstruction.arrays().items()}
+    total = samples["count"].sum() + samples["unassigned_count"].sum()
+    assert total == round(film.aov("alpha").sum() * film.iterations)
     # Most surfaces are seen through the middle of the lens and at the moment in the middle as well.
-    assert seen["other_count"].sum() < 0.05 * seen["count"].sum()
+    assert samples["unassigned_count"].sum() < 0.05 * samples["count"].sum()
 
 
 def test_light_stays_on_what_moves():
@@ -129,23 +130,23 @@ def test_light_stays_on_what_moves():
     )
     scene = replace(scene, shutter=tuple(replace(scene, meshes=meshes) for meshes in moved))
     film = ir.render(scene, ir.RenderSettings(width=32, height=32, iterations=8, light_paths=64, max_bounces=0))
-    seen = {name: array.numpy() for name, array in film.reconstruction.arrays().items()}
+    samples = {name: array.numpy() for name, array in film.reconstruction.arrays().items()}
     # The third of four moments is the one in the middle: there the panels meet in the middle of the picture.
     sides = np.arange(32 * 32) % 32 < 16
-    lit, dark = ((side & (seen["count"] > 0)) for side in (sides, ~sides))
+    lit, dark = ((side & (samples["count"] > 0)) for side in (sides, ~sides))
     assert lit.sum() > 20 and abs(lit.sum() - dark.sum()) <= 0.1 * lit.sum()
-    means = seen["direct"][lit, 0] / seen["count"][lit]
+    means = samples["direct"][lit, 0] / samples["count"][lit]
     # Irradiance over π is the same everywhere on a plane in the sun, and nothing on one turned away.
     np.testing.assert_allclose(means, means.mean(), rtol=1e-3)
-    assert means.mean() > 0.0 and not seen["direct"][dark].any() and not seen["other_count"].any()
+    assert means.mean() > 0.0 and not samples["direct"][dark].any() and not samples["unassigned_count"].any()
 
 
 def test_what_is_sharp_pays_nothing():
     """Without lens and shutter nothing is kept for them."""
     renderer = ir.Renderer(procedural.cornell_box(), replace(BLURRED, iterations=1))
-    renderer.render()
+    film = renderer.render()
     assert renderer._gbuffer.surface_point.shape[0] == 0
-    assert "sample_pixels" not in renderer.launcher._kept
+    assert not film.reconstruction._scratch._arrays
     assert ir.Renderer(in_motion(), replace(BLURRED, iterations=1))._gbuffer.surface_point.shape[0] == 48 * 48
 
 

@@ -72,7 +72,7 @@ def test_films_of_different_size_do_not_merge(device):
     with pytest.raises(ir.InputError, match="cannot merge 5x5 into 12x8"):
         renderer.new_film().merge(other.new_film())
     dark = Renderer(furnace(0.5, 0.0, level=1), SETTINGS, device=device)
-    with pytest.raises(ir.InputError, match="shows what emits"):
+    with pytest.raises(ir.InputError, match="a film with emission and one without"):
         renderer.new_film().merge(dark.new_film())
 
 

@@ -36,8 +36,8 @@ def test_all_tiles_have_two_iterations_if_there_is_time():
     """After one, all are chosen, or as many as there is time for: the worst; all again if that is next to none."""
     squares, once = np.arange(64.0), np.ones(64, np.int32)
     assert select_tiles(squares, once).all()
-    np.testing.assert_array_equal(np.flatnonzero(select_tiles(squares, once, most=20.5)), np.arange(44, 64))
-    assert select_tiles(squares, once, most=7.0).all()
+    np.testing.assert_array_equal(np.flatnonzero(select_tiles(squares, once, max_tiles=20.5)), np.arange(44, 64))
+    assert select_tiles(squares, once, max_tiles=7.0).all()
 
 
 def test_iterations_go_with_the_root_of_the_error():

@@ -1,4 +1,4 @@
-"""What happens on Ctrl-C: the work in flight is cancelled, and the film keeps the iterations that are complete."""
+"""Interruption of a render by Ctrl-C: launches in flight are cancelled, and the film keeps its complete iterations."""
 
 import signal
 import threading
@@ -12,10 +12,10 @@ from warp_ir.film import Film
 
 @contextmanager
 def cancel_on_signal(launcher: Launcher, film: Film) -> Iterator[None]:
-    """Lets SIGINT and SIGTERM cancel the launches inside, and writes the signal's number to `film.interrupted`.
+    """Cancels the launches inside the block on SIGINT or SIGTERM, and writes its number to `film.interrupted`.
 
-    The launches raise `Cancelled` as soon as their current band of indices is done. Python delivers signals to its
-    main thread alone; in any other thread this does nothing.
+    The launches raise `Cancelled` when the current bands of indices are done. Python delivers signals to its main
+    thread only; in any other thread this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

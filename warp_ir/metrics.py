@@ -1,8 +1,8 @@
-"""How far a picture is from the truth: the three numbers that every claim of this project is made with.
+"""Error metrics of a picture against a reference: relative mean squared error, mean ratio, and z scores.
 
-The relative mean squared error says how far, the mean ratio whether the picture as a whole is too
-bright or dark (the error of virtual point lights is correlated over the image: it can be a shift that
-looks like no noise at all), and the z scores whether the difference is explained by noise.
+The relative mean squared error measures the size of the error. The mean ratio tells whether the whole picture is too
+bright or too dark: the error of virtual point lights is correlated over the image, and can be a shift without visible
+noise. The z scores tell whether noise explains the difference.
 """
 
 import numpy as np
@@ -18,16 +18,16 @@ def relative_mse(
 ) -> float:
     """Mean of (x − r)² / (r² + 0.01·m²) over pixels and channels, with m the mean of the reference r.
 
-    The second term of the denominator keeps black pixels from deciding alone; a scene twice as bright
-    has the same error.
+    The second term of the denominator limits the weight of black pixels. The result does not change when picture and
+    reference are scaled.
 
     Args:
         image: Linear radiance x, any shape.
         reference: Linear radiance r, the same shape.
-        reference_error: The reference's own standard error, the same shape. What it adds to the result
-            is subtracted; a picture as good as the reference then scores around 0, below as well as above.
-        scale: Stands for r in the denominator, the same shape. Where a noisy r is too dark by chance it weighs
-            its own error most, and more than its standard error knows; a smooth picture without that noise does not.
+        reference_error: Standard error of the reference, the same shape. Its contribution to the result is subtracted:
+            a picture as good as the reference then has a result near 0, positive or negative.
+        scale: Replaces r in the denominator, the same shape. A noisy r that is too dark by chance gives its own error
+            a large weight, and its standard error underestimates that; a smooth `scale` avoids this bias.
 
     Raises:
         InputError: The shapes differ, or the reference is black.
@@ -60,16 +60,16 @@ def mean_ratio(image: Array, reference: Array) -> float:
 def z_scores(
     image: Array, standard_error: Array, reference: Array, reference_error: Array | float = 0.0
 ) -> npt.NDArray[np.float64]:
-    """Differences in units of their standard deviation: (x − r) / √(σ² + σᵣ²), shape as the image.
+    """Differences in units of their standard deviation, (x − r) / √(σ² + σᵣ²), of the shape of the image.
 
-    If both pictures are unbiased and their standard errors honest, the scores have mean 0 and variance
-    1. Where both errors are 0 the score is 0 if the values agree and ±∞ if they do not.
+    If both pictures are unbiased and their standard errors correct, the scores have mean 0 and variance 1. Where both
+    standard errors are 0, the score is 0 if the values agree and ±∞ if they do not.
 
     Args:
         image: x, any shape.
         standard_error: σ of x, the same shape.
         reference: r, the same shape.
-        reference_error: σᵣ of r, the same shape; 0 for a value that is known.
+        reference_error: σᵣ of r, the same shape; 0 for an exact reference.
 
     Raises:
         InputError: The shapes differ.
@@ -83,7 +83,7 @@ def z_scores(
 
 
 def _pair(a: Array, b: Array) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Both as float64, checked to have one shape."""
+    """Both arrays as float64; raises `InputError` if their shapes differ or they are empty."""
     a64, b64 = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if a64.shape != b64.shape:
         raise InputError(f"the pictures differ in shape: {a64.shape} and {b64.shape}")

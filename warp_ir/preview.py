@@ -1,13 +1,10 @@
-"""Pictures of the method at work: the virtual point lights in the scene they belong to.
-
-Drawn off-screen by PyVista: no display is needed.
-"""
+"""Pictures of virtual point lights in their scene, drawn off-screen by PyVista: no display is needed."""
 
 import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,18 +12,42 @@ import numpy.typing as npt
 from warp_ir.image.io import check_output, whole_file
 from warp_ir.scene import Camera, InputError, Projection, Scene
 
+if TYPE_CHECKING:
+    import pyvista
+
 _DECADES = 4.0
-"""VPLs this many powers of ten below the strongest are drawn at the least brightness."""
+"""VPLs are drawn at the least brightness if their intensity is this many powers of ten below the strongest."""
 _POINT_SIZES = (14.0, 10.0, 7.0, 5.0, 4.0)
-"""Pixels of VPLs of bounce 0, 1, ...; the last stands for all others. For a picture 1000 pixels high; never below 3."""
+"""Diameters of VPLs of bounce 0, 1, ..., the last for all further ones, in a picture 1000 pixels high [pixels]."""
+_MIN_POINT_SIZE = 3.0
 _BACKGROUND = "#16181d"
-_MOST_TRIANGLES = 5_000_000
-"""Of instances, so many are drawn as make about this number."""
+_MAX_TRIANGLES = 5_000_000
+"""Approximate limit on the triangles drawn; of a scene with more, an even selection of the instances is drawn."""
+
+
+class VplCloud(Protocol):
+    """The arrays of a VPL cloud that are drawn, as in `warp_ir.vpl.trace.Vpls`."""
+
+    @property
+    def positions(self) -> npt.NDArray[np.floating]:
+        """[n, 3], world space."""
+
+    @property
+    def intensity(self) -> npt.NDArray[np.floating]:
+        """[n, 3], in any unit."""
+
+    @property
+    def bounce(self) -> npt.NDArray[np.integer]:
+        """[n], number of reflections before."""
+
+    @property
+    def directional(self) -> npt.NDArray[np.bool_]:
+        """[n], whether the VPL is infinitely far away."""
 
 
 def picture_vpls(
     scene: Scene,
-    vpls: Any,
+    vpls: VplCloud,
     path: str | os.PathLike[str],
     *,
     view: str = "outside",
@@ -35,17 +56,19 @@ def picture_vpls(
 ) -> Path:
     """Draws virtual point lights as dots in the scene.
 
-    Hue is the VPL's own, brightness the logarithm of its flux, size its bounce (the earlier, the
-    larger). Directional VPLs (sun and sky) have no place; an inscription counts them.
+    The hue of a dot is that of the VPL, its brightness the logarithm of the intensity; earlier bounces are larger.
+    Directional VPLs (sun and sky) have no position; their number is written in the picture.
 
     Args:
-        scene: The scene the VPLs were traced in.
-        vpls: A record as `trace_vpls` returns it.
+        scene: The scene in which the VPLs were traced.
+        vpls: The VPLs, from `trace_vpls`.
         path: The `.png` file to write.
-        view: "outside" looks down on everything, through the walls that are in the way; "camera" is the
-            scene's own camera.
-        width: Pixels.
-        height: Pixels; by default from the camera's aspect, or 3/4 of the width from outside.
+        view: "outside" shows the whole scene from outside, without the walls in front; "camera" is the scene's camera.
+        width: Width of the picture [pixels].
+        height: Height [pixels]; None: from the camera's aspect, or 3/4 of the width from outside.
+
+    Returns:
+        The path of the written file.
 
     Raises:
         InputError: The file cannot be written, or the view is unknown.
@@ -65,7 +88,7 @@ def picture_vpls(
         camera = scene.camera.fit(width, height) if view == "camera" else _outside(scene, width / height)
         _add_meshes(plotter, scene, camera, open_front=view == "outside")
         _add_points(plotter, vpls, camera, 0.01 * (scene.extent or 1.0), height)
-        _aim(plotter, camera)
+        _set_camera(plotter, camera)
         with whole_file(path) as temporary:
             plotter.screenshot(str(temporary))
     finally:
@@ -74,7 +97,7 @@ def picture_vpls(
 
 
 def _outside(scene: Scene, aspect: float) -> Camera:
-    """A camera that sees (nearly, at the corners) all of the scene, from beside and above its own camera."""
+    """A camera that sees the whole scene except some corners, from a direction beside and above its own camera."""
     lower, upper = scene.bounds()
     center, radius = 0.5 * (lower + upper), 0.5 * (scene.extent or 1.0)
     right, up, back = (scene.camera.world_from_camera[:3, k] for k in range(3))
@@ -85,28 +108,27 @@ def _outside(scene: Scene, aspect: float) -> Camera:
     return Camera.look_at(eye.tolist(), center.tolist(), up.tolist(), fov=fov, aspect=aspect)
 
 
-def _written_out(scene: Scene) -> Scene:
-    """The scene without instances: their copies, or of too many an even selection."""
-    step = max(1, math.ceil(scene.triangles_seen / _MOST_TRIANGLES))
-    thinned = (replace(g, matrices=g.matrices[::step], colors=_every(g.colors, step)) for g in scene.instances)
-    return replace(scene, instances=tuple(thinned)).flat()
+def _flattened(scene: Scene) -> Scene:
+    """The scene with copies of its instances, or of an even selection if they have too many triangles."""
+    step = max(1, math.ceil(scene.triangles_seen / _MAX_TRIANGLES))
+    selected = (
+        replace(g, matrices=g.matrices[::step], colors=None if g.colors is None else g.colors[::step])
+        for g in scene.instances
+    )
+    return replace(scene, instances=tuple(selected)).flat()
 
 
-def _every(rows: Any, step: int) -> Any:
-    return None if rows is None else rows[::step]
+def _add_meshes(plotter: "pyvista.Plotter", scene: Scene, camera: Camera, *, open_front: bool) -> None:
+    """Adds the surfaces in their albedo, dimmed, and shaded by the cosine to the camera.
 
-
-def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool) -> None:
-    """The surfaces in their albedo, dimmed, and shaded by how they face the camera.
-
-    From outside, the triangles in front that face away from the middle of the scene (the near walls,
-    however they are wound) are left out, so that one can look in.
+    With `open_front`, triangles between the camera and the rest of the scene (near walls of either winding) are left
+    out, so that the inside is visible.
     """
     import pyvista
 
     lower, upper = scene.bounds()
     eye, center = camera.world_from_camera[:3, 3], 0.5 * (lower + upper)
-    for mesh in _written_out(scene).meshes:
+    for mesh in _flattened(scene).meshes:
         corners = mesh.points[mesh.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
@@ -117,23 +139,23 @@ def _add_meshes(plotter: Any, scene: Scene, camera: Camera, *, open_front: bool)
         if mesh.colors is not None:
             albedo = mesh.colors.mean(axis=1)
         shade = np.clip(albedo, 0.0, 1.0) ** (1 / 2.2) * (0.25 + 0.35 * np.abs(facing))[:, None]
-        keep = np.ones(len(middle), dtype=bool)
+        visible = np.ones(len(middle), dtype=bool)
         if open_front:
-            # A wall is a plane with the whole scene on its far side.
+            # A triangle is part of a near wall if the whole scene is behind its plane.
             span = scene.extent or 1.0
             outward = normals * np.sign(facing)[:, None]
             reach = np.abs(outward) @ (0.5 * (upper - lower))
-            keep = np.einsum("nk,nk->n", outward, middle - center) < reach - 0.02 * span
-        if not keep.any():
+            visible = np.einsum("nk,nk->n", outward, middle - center) < reach - 0.02 * span
+        if not visible.any():
             continue
-        triangles: Any = mesh.triangles[keep]
+        triangles: Any = mesh.triangles[visible]
         surface = pyvista.PolyData.from_regular_faces(mesh.points.astype(np.float64), triangles)
-        surface.cell_data["shade"] = np.round(255.0 * shade[keep]).astype(np.uint8)
+        surface.cell_data["shade"] = np.round(255.0 * shade[visible]).astype(np.uint8)
         plotter.add_mesh(surface, scalars="shade", rgb=True, lighting=False)
 
 
-def _add_points(plotter: Any, vpls: Any, camera: Camera, lift: float, height: int) -> None:
-    """A dot for each VPL that has a place, lifted by that much towards the camera, out of its surface."""
+def _add_points(plotter: "pyvista.Plotter", vpls: VplCloud, camera: Camera, offset: float, height: int) -> None:
+    """Adds a dot for each local VPL, moved by `offset` towards the camera so that its surface does not hide it."""
     import pyvista
 
     local = ~np.asarray(vpls.directional, dtype=bool)
@@ -141,16 +163,16 @@ def _add_points(plotter: Any, vpls: Any, camera: Camera, lift: float, height: in
     to_eye = camera.world_from_camera[:3, 3] - positions
     if camera.projection == Projection.ORTHOGRAPHIC:
         to_eye[:] = camera.world_from_camera[:3, 2]
-    positions = positions + lift * to_eye / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-300)[:, None]
+    positions = positions + offset * to_eye / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-300)[:, None]
     bounce = np.minimum(np.asarray(vpls.bounce)[local], len(_POINT_SIZES) - 1)
     colors = dot_colors(np.asarray(vpls.intensity)[local])
     for k, size in enumerate(_POINT_SIZES):
         if (bounce == k).any():
             cloud = pyvista.PolyData(np.ascontiguousarray(positions[bounce == k], dtype=np.float32))
-            cloud.point_data["shine"] = colors[bounce == k]
-            size = max(3.0, size * height / 1000.0)
+            cloud.point_data["color"] = colors[bounce == k]
+            size = max(_MIN_POINT_SIZE, size * height / 1000.0)
             plotter.add_mesh(
-                cloud, scalars="shine", rgb=True, lighting=False, point_size=size, render_points_as_spheres=True
+                cloud, scalars="color", rgb=True, lighting=False, point_size=size, render_points_as_spheres=True
             )
     if not local.all():
         count = int(np.count_nonzero(~local))
@@ -158,10 +180,10 @@ def _add_points(plotter: Any, vpls: Any, camera: Camera, lift: float, height: in
 
 
 def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """Screen colours of VPLs, uint8 [n, 3]: the hue of the intensity, its logarithm as the brightness.
+    """Display colours of VPLs, uint8 [n, 3]: the hue of the intensity, and its logarithm as brightness.
 
     Args:
-        intensity: [n, 3]; its scale does not matter.
+        intensity: [n, 3], in any unit.
     """
     power = np.asarray(intensity, dtype=np.float64)
     peak = power.max(axis=1, initial=0.0)
@@ -174,8 +196,8 @@ def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
     return colors
 
 
-def _aim(plotter: Any, camera: Camera) -> None:
-    """Gives VTK's camera the place, direction and window of ours."""
+def _set_camera(plotter: "pyvista.Plotter", camera: Camera) -> None:
+    """Sets position, direction and window of VTK's camera."""
     left, right, bottom, top = camera.window
     matrix = camera.world_from_camera
     vtk_camera = plotter.camera

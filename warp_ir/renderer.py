@@ -103,7 +103,11 @@ class Renderer:
         first = self._shutter[0]
         assert self._layout is not None
         film = Film(
-            first.camera.columns, first.camera.rows, self.launcher, first.scene.frame, glows=self._layout.emission
+            first.camera.columns,
+            first.camera.rows,
+            self.launcher,
+            first.scene.frame,
+            has_emission=self._layout.emission,
         )
         film.settings = self.settings
         if self._resolved.filter:
@@ -146,7 +150,7 @@ class Renderer:
                     spent = profile.since(before)
                     per_ray = spent["primary"] / (profile.counts["primary_rays"] - rays)
                     report = scheduler.update(
-                        reserve=self._picture_seconds(film, per_ray), fixed=spent["emission"] / spent.total()
+                        reserve=self._picture_seconds(film, per_ray), fixed_share=spent["emission"] / spent.total()
                     )
                 except Cancelled:
                     break

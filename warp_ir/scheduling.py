@@ -1,9 +1,9 @@
-"""When a render stops, and which tiles each iteration is for.
+"""Adaptive sampling per tile of 8 x 8 pixels, and the limits that end a render.
 
-After n iterations a tile has the squared error e/n; one more takes away e/n - e/(n+1). Iterations are for those tiles
-from which they take away most error for their time, so that in the end n is in proportion to √e, as it is where a sum
-of errors is reached with fewest samples (Neyman 1934). A tile that is good enough costs nothing more until the others
-are as good. When there is no more time for all tiles that an iteration should be for, the worst of them get it.
+After n iterations a tile has the squared error e/n; one more iteration reduces it by e/n - e/(n+1). Each iteration
+samples the tiles where the reduction per unit of time is largest. In the end n is proportional to √e, the allocation
+that reaches a given sum of errors with the fewest samples (Neyman 1934): a tile with a small error is not sampled until
+the others have one as small. If the time left is too short for all the tiles of an iteration, the worst ones get it.
 """
 
 import math
@@ -15,75 +15,76 @@ import numpy.typing as npt
 from warp_ir.film.film import Film
 from warp_ir.settings import RenderSettings
 
-_FEWEST = 2
-"""Iterations that all tiles get, if there is time: fewer say little about the error of a tile."""
-_FIXED = 0.2
-"""Time of an iteration without tiles to that of one with all of them, about: choices must not hang on clocks."""
-_LEAST = 1 / 8
-"""Share of the tiles that an iteration is for at least: else it is no work for many cores."""
-_HASTE = 0.8
-"""Share of the time left that the last iteration is planned to take: the worst tiles take longer than others."""
+_MIN_ITERATIONS = 2
+"""Iterations that all tiles get if there is time: fewer give no reliable error of a tile."""
+_FIXED_COST = 0.2
+"""Approximate cost of an iteration without tiles, relative to one with all tiles. A constant, not a measurement, so
+that the choice of tiles is independent of timing."""
+_MIN_TILE_SHARE = 1 / 8
+"""Least fraction of the tiles in an iteration: fewer do not occupy many cores."""
+_TIME_MARGIN = 0.8
+"""Fraction of the time left that the last iteration is planned to take: the worst tiles take longer than the mean."""
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a render has come, as `render` tells its `progress` callback after every iteration."""
+    """Progress of a render, as passed to the `progress` callback after every iteration."""
 
     iterations: int
-    """Iterations done."""
+    """Number of iterations done."""
     seconds: float
     """Seconds of rendering so far."""
     error: float
-    """As `Film.error`, last measured; without the filter's part while the target is far. NaN before two iterations."""
+    """`Film.error` when last measured, without the filter's bias far from the target; NaN before two iterations."""
     fraction: float
-    """Share of the nearest limit that is used up, 0 to 1."""
+    """Fraction of the nearest limit that is used up, 0 to 1."""
     seconds_left: float
-    """Estimate of what remains [s]; NaN if unknown."""
+    """Estimated remaining time [s]; NaN if unknown."""
 
 
 class AdaptiveScheduler:
-    """Watches a film while iterations are added to it, and chooses the tiles of the next."""
+    """Chooses the tiles of the next iteration of a film, and reports its progress."""
 
-    def __init__(self, film: Film, settings: RenderSettings, chooses: bool) -> None:
-        """Begins with a film that may hold iterations; `chooses` says whether tiles may be left out."""
-        self._film, self._settings, self._chooses = film, settings, chooses
-        self._before = film.seconds, film.iterations, int(film.tile_iterations.sum())
+    def __init__(self, film: Film, settings: RenderSettings, adaptive: bool) -> None:
+        """Starts from a film that may hold iterations; `adaptive` says whether iterations may skip tiles."""
+        self._film, self._settings, self._adaptive = film, settings, adaptive
+        self._start = film.seconds, film.iterations, int(film.tile_iterations.sum())
         self._error = math.nan
 
-    def update(self, reserve: float, fixed: float) -> Progress:
-        """Takes note of an iteration, and chooses the tiles of the next.
+    def update(self, reserve: float, fixed_share: float) -> Progress:
+        """Reports an iteration that has been added to the film, and chooses the tiles of the next.
 
         Args:
-            reserve: Time [s] to keep for the end.
-            fixed: Share of the time since the beginning that would have passed without any tiles.
+            reserve: Time to reserve for making the picture [s].
+            fixed_share: Fraction of the time so far that does not depend on the number of tiles.
         """
         film, limit = self._film, self._settings.time_limit
-        begin, iterations, tiles = self._before
-        seconds = film.seconds - begin
-        per_iteration = fixed * seconds / (film.iterations - iterations)
-        per_tile = (1.0 - fixed) * seconds / (int(film.tile_iterations.sum()) - tiles)
+        start_seconds, start_iterations, start_tiles = self._start
+        seconds = film.seconds - start_seconds
+        per_iteration = fixed_share * seconds / (film.iterations - start_iterations)
+        per_tile = (1.0 - fixed_share) * seconds / (int(film.tile_iterations.sum()) - start_tiles)
         left = math.inf if limit is None else limit - reserve - film.seconds
-        most = (_HASTE * left - per_iteration) / per_tile
-        short = self._chooses and per_iteration + per_tile * film.chosen.sum() > left
-        due = _is_due(film.iterations)
-        if short or due:
+        max_tiles = (_TIME_MARGIN * left - per_iteration) / per_tile
+        does_not_fit = self._adaptive and per_iteration + per_tile * film.chosen.sum() > left
+        measure_error = _is_error_due(film.iterations)
+        if does_not_fit or measure_error:
             squares = film.squared_errors()
-            if due and math.sqrt(squares.sum()) <= (self._settings.target_error or 0.0):
-                squares = film.squared_errors(filtered=True)  # dear: the picture has to be made
-            if due:
+            if measure_error and math.sqrt(squares.sum()) <= (self._settings.target_error or 0.0):
+                squares = film.squared_errors(filtered=True)  # expensive: it makes the picture
+            if measure_error:
                 self._error = math.sqrt(squares.sum())
-            if self._chooses:
-                film.choose(select_tiles(squares, film.tile_iterations, most))
+            if self._adaptive:
+                film.choose(select_tiles(squares, film.tile_iterations, max_tiles))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())
 
     def _progress(self, needed: float) -> Progress:
-        """What is used up of each limit, if one more iteration needs so much time; the largest share counts."""
+        """Progress towards the nearest limit, if the next iteration and the picture need `needed` seconds."""
         film, settings, error = self._film, self._settings, self._error
         shares = [film.iterations / settings.iteration_limit]
         if settings.time_limit is not None:
-            # An iteration that would end beyond the limit is not begun.
+            # An iteration that would exceed the limit is not started.
             shares.append((film.seconds + needed) / settings.time_limit)
         if settings.target_error is not None and error > 0.0:
             shares.append((settings.target_error / error) ** 2)
@@ -94,31 +95,31 @@ class AdaptiveScheduler:
         return Progress(film.iterations, film.seconds, error, fraction, left)
 
 
-def select_tiles(squares: Floats, iterations: npt.NDArray[np.int32], most: float = math.inf) -> Mask:
-    """Which tiles the next iteration should be for, bool [tiles].
+def select_tiles(squares: Floats, iterations: npt.NDArray[np.int32], max_tiles: float = math.inf) -> Mask:
+    """Selects the tiles of the next iteration, bool [tiles].
 
     Args:
-        squares: What each tile has in the squared error of the picture.
-        iterations: How many each has had.
-        most: How many tiles there is time for; if that is too few, all are chosen.
+        squares: Contribution of each tile to the squared error of the picture, [tiles].
+        iterations: Number of iterations of each tile, [tiles].
+        max_tiles: Number of tiles for which there is time; if it is below the minimum, all tiles are selected.
     """
     count = len(squares)
-    least = math.ceil(_LEAST * count)
+    min_tiles = math.ceil(_MIN_TILE_SHARE * count)
     gains = squares / (iterations + 1)
     order = np.argsort(-gains, kind="stable")
-    cost = _FIXED + (1.0 - _FIXED) * np.arange(1, count + 1) / count
+    cost = _FIXED_COST + (1.0 - _FIXED_COST) * np.arange(1, count + 1) / count
     best = count
-    if iterations.max() >= _FEWEST:
-        best = least + int(np.argmax((np.cumsum(gains[order]) / cost)[least - 1 :]))
-    if most < least:
+    if iterations.max() >= _MIN_ITERATIONS:
+        best = min_tiles + int(np.argmax((np.cumsum(gains[order]) / cost)[min_tiles - 1 :]))
+    if max_tiles < min_tiles:
         return np.ones(count, bool)
     out = np.zeros(count, bool)
-    out[order[: int(min(best, most))]] = True
+    out[order[: int(min(best, max_tiles))]] = True
     return out
 
 
-def _is_due(iterations: int) -> bool:
-    """Measuring the error may cost as much as a cheap iteration: it is done every eighth part of the way."""
+def _is_error_due(iterations: int) -> bool:
+    """Whether to measure the error, which may cost as much as a cheap iteration: after every 12 % more iterations."""
     due = 2
     while due < iterations:
         due += due // 8 + 1

@@ -58,7 +58,7 @@ def test_furnace_with_a_textured_glow(estimator, device):
     glow *= np.array([1.0, 1.0, 1.0]) / glow.mean(axis=(0, 1))
     film = render(room(emission_texture=Texture("glow", glow)), estimator, device, width=16, height=16)
     # A picture of the emission itself apart: what is reflected is ρ mean Le / (1 - ρ) = 1.
-    reflected = film.aov("direct").mean() + film.aov("indirect").mean() - film._sum("emission").mean()
+    reflected = film.aov("direct").mean() + film.aov("indirect").mean() - film._radiance_of("emission").mean()
     error = 5.0 * float(film.standard_error().mean())
     assert abs(reflected - 1.0) < error + 0.02
 

@@ -1,4 +1,4 @@
-"""The film: the running mean of the iterations, its standard error, and the picture made of it."""
+"""The film: the running mean of the iterations, its standard error, and the picture made from them."""
 
 from warp_ir.film import accumulate
 from warp_ir.film.film import Film

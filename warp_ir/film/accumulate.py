@@ -1,9 +1,10 @@
-"""What a film holds on the device, and how an iteration is added to it.
+"""The film's arrays on the device, and the kernel that adds an iteration to them.
 
-The mean and the deviation are brought up to date by how far each iteration is off the mean (Welford 1962): what is lost
-to rounding is forgotten as the samples are that it came with, and float32 does not drift over a hundred thousand
-iterations.
+Mean and standard deviation are updated by the difference of each iteration from the running mean (Welford 1962).
+Rounding errors decay with the running mean, so float32 does not drift over a hundred thousand iterations.
 """
+
+from typing import Any
 
 import warp as wp
 
@@ -16,75 +17,79 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 @wp.struct
 class FilmData:
-    """Radiance, a mean over iterations, and what else there is, sums; one row per pixel."""
+    """Means of the radiance and sums of the other quantities over the iterations; one row per pixel."""
 
     count: wp.array[wp.int32]  # iterations
-    emission: wp.array[wp.vec3]  # empty if there can be none
-    direct: wp.array[wp.vec3]  # light reflected once
+    emission: wp.array[wp.vec3]  # no rows if the camera cannot see emission
+    direct: wp.array[wp.vec3]  # radiance of light that was reflected once
     indirect: wp.array[wp.vec3]
-    deviation: wp.array[wp.vec3]  # standard deviation of the sum of the three
+    standard_deviation: wp.array[wp.vec3]  # of emission + direct + indirect
     albedo: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
     position: wp.array[wp.vec3]
     depth: wp.array[wp.float32]
-    hits: wp.array[wp.int32]  # iterations in which the pixel's ray met a surface
-    rejected: wp.array[wp.int32]  # iterations whose value was not finite
-    mesh: wp.array[wp.int32]  # what the first iteration saw
+    hits: wp.array[wp.int32]  # iterations in which the camera ray met a surface
+    rejected: wp.array[wp.int32]  # iterations whose radiance was not finite
+    mesh: wp.array[wp.int32]  # index into Scene.meshes, from the first iteration; -1: background
+
+
+FIELDS: tuple[str, ...] = tuple(FilmData.vars)
+"""Names of the arrays of a `FilmData`."""
 
 
 @wp.func
-def _finite(v: wp.vec3) -> bool:
+def _is_finite(v: wp.vec3) -> bool:
     return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
 
 
 @wp.func
-def _deviation(old: wp.vec3, off: wp.vec3, share: float) -> wp.vec3:
-    """The standard deviations when a sample is added which is so much of them all, and so far off their mean."""
-    # Squares are taken in a scale in which they neither overflow nor vanish.
-    scale = wp.max(wp.max(wp.max(old), wp.max(wp.abs(off))), 1.0e-37)
+def _update_standard_deviation(old: wp.vec3, difference: wp.vec3, weight: float) -> wp.vec3:
+    """Standard deviation after adding a sample of a given weight, 1 / count, and difference from the old mean."""
+    # The squares are scaled so that they neither overflow nor underflow.
+    scale = wp.max(wp.max(wp.max(old), wp.max(wp.abs(difference))), 1.0e-37)
     a = old * (1.0 / scale)
-    b = off * (1.0 / scale)
-    variance = (wp.cw_mul(a, a) + wp.cw_mul(b, b) * share) * (1.0 - share)
+    b = difference * (1.0 / scale)
+    variance = (wp.cw_mul(a, a) + wp.cw_mul(b, b) * weight) * (1.0 - weight)
     return wp.vec3(wp.sqrt(variance[0]), wp.sqrt(variance[1]), wp.sqrt(variance[2])) * scale
 
 
 @wp.func
 def emission_of(film: FilmData, i: int) -> wp.vec3:
-    """Radiance that reaches the camera without reflection."""
+    """Mean radiance that reaches pixel `i` without reflection."""
     if film.emission.shape[0] > 0:
         return film.emission[i]
     return wp.vec3(0.0)
 
 
 @wp.kernel
-def _add(
+def _add_iteration(
     first: int,
     gbuffer: GBuffer,
     exposure: float,
     film: FilmData,
 ) -> None:
-    """Adds one iteration's estimates."""
+    """Adds the estimates of one iteration to the pixel's means and sums."""
     i = pixel_at(gbuffer.tiles, first + wp.tid())
     if i < 0:
         return
     before = film.count[i]
-    le = wp.vec3(0.0)
+    emission = wp.vec3(0.0)
     if film.emission.shape[0] > 0:
-        le = gbuffer.emission[i] * exposure
-    once = wp.cw_mul(gbuffer.albedo[i], gbuffer.normal_or_direct[i]) * exposure
-    more = wp.cw_mul(gbuffer.albedo[i], gbuffer.indirect[i]) * exposure
-    if not _finite(le + once + more):
+        emission = gbuffer.emission[i] * exposure
+    direct = wp.cw_mul(gbuffer.albedo[i], gbuffer.normal_or_direct[i]) * exposure
+    indirect = wp.cw_mul(gbuffer.albedo[i], gbuffer.indirect[i]) * exposure
+    if not _is_finite(emission + direct + indirect):
         film.rejected[i] += 1
-        le = wp.vec3(0.0)
-        once = wp.vec3(0.0)
-        more = wp.vec3(0.0)
-    share = 1.0 / float(before + 1)
-    off = le + once + more - (emission_of(film, i) + film.direct[i] + film.indirect[i])
-    film.deviation[i] = _deviation(film.deviation[i], off, share)
+        emission = wp.vec3(0.0)
+        direct = wp.vec3(0.0)
+        indirect = wp.vec3(0.0)
+    weight = 1.0 / float(before + 1)
+    difference = emission + direct + indirect - (emission_of(film, i) + film.direct[i] + film.indirect[i])
+    film.standard_deviation[i] = _update_standard_deviation(film.standard_deviation[i], difference, weight)
     if film.emission.shape[0] > 0:
-        film.emission[i] += (le - film.emission[i]) * share
-    film.direct[i] += (once - film.direct[i]) * share
-    film.indirect[i] += (more - film.indirect[i]) * share
+        film.emission[i] += (emission - film.emission[i]) * weight
+    film.direct[i] += (direct - film.direct[i]) * weight
+    film.indirect[i] += (indirect - film.indirect[i]) * weight
     film.count[i] = before + 1
     if before == 0:
         film.mesh[i] = gbuffer.mesh[i]
@@ -96,6 +101,22 @@ def _add(
         film.depth[i] += gbuffer.depth[i]
 
 
+def new_film_data(pixels: int, has_emission: bool, launcher: Launcher) -> FilmData:
+    """An empty `FilmData`; `has_emission` says whether the camera may see emission."""
+    data = FilmData()
+    for name in ("emission", "direct", "indirect", "standard_deviation", "albedo", "normal", "position"):
+        setattr(data, name, launcher.zeros(pixels if has_emission or name != "emission" else 0, wp.vec3))
+    data.depth = launcher.zeros(pixels, wp.float32)
+    for name in ("count", "hits", "rejected", "mesh"):
+        setattr(data, name, launcher.zeros(pixels, wp.int32))
+    return data
+
+
+def film_arrays(data: FilmData) -> dict[str, wp.array[Any]]:
+    """The arrays of a `FilmData` by field name."""
+    return {name: getattr(data, name) for name in FIELDS}
+
+
 def add_samples(gbuffer: GBuffer, exposure: float, film: FilmData, launcher: Launcher) -> None:
     """Adds one iteration, the tiles of a `GBuffer` that an estimator has filled, to a `FilmData`."""
-    launcher.launch(_add, indices(gbuffer.tiles), [gbuffer, exposure, film])
+    launcher.launch(_add_iteration, indices(gbuffer.tiles), [gbuffer, exposure, film])

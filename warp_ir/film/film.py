@@ -1,88 +1,121 @@
-"""The film: a mean, a standard deviation and a count. Iterations add, films merge, the picture is the mean."""
+"""The film: a mean, a standard deviation and a count per pixel. Iterations are added, films are merged."""
 
 import math
 import os
-import zipfile
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.film.accumulate import FilmData, add_samples
+from warp_ir.device_scene import DeviceFrame
+from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, new_film_data
 from warp_ir.film.denoise import denoise
-from warp_ir.film.error_estimate import measure
+from warp_ir.film.error_estimate import tile_errors
+from warp_ir.film.storage import FilmState, read_arrays, read_state, reconstruction_names, write_film
 from warp_ir.gbuffer import GBuffer
 from warp_ir.scene import InputError
-from warp_ir.tiles import TILE, all_tiles, some_tiles, tile_count
+from warp_ir.settings import RenderSettings
+from warp_ir.tiles import TILE, Tiles, all_tiles, some_tiles, tile_count
 
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
-"""What `Film.aov` can give beside the radiance."""
-Image = npt.NDArray[Any]
+"""Names that `Film.aov` accepts."""
+Image = npt.NDArray[np.float32]
+"""[height, width, 3]."""
 _RADIANCE = ("emission", "direct", "indirect")
+"""The fields of `FilmData` that add up to the radiance."""
 _CLEAN_ITERATIONS = 8
-"""From here on albedo and normals are smoother than what a denoiser would make of them."""
-_SEEN = "seen_"
-"""What the names of the filter's arrays begin with in a file."""
+"""Iterations from which the mean albedo and normals have less noise than a denoiser would leave in them."""
+
+
+class PictureFilter(Protocol):
+    """What a film requires of the `Reconstruction` that filters its picture."""
+
+    def accumulate(self, gbuffer: GBuffer, shutter_sample: int = 0) -> None:
+        """Adds one iteration's samples."""
+
+    def arrays(self) -> dict[str, "wp.array[Any]"]:
+        """The sums over the samples by name; they are saved with the film."""
+
+    def merge(self, other: Self) -> None:
+        """Adds the samples of another film's filter."""
+
+    def passes(self, iterations: int) -> float:
+        """Cost of `resolve`, in passes of camera rays through all pixels."""
+
+    def resolve(self, film: FilmData, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
+        """Direct and indirect radiance, [2, height, width, 3]; with `features` [5, ...], see `Reconstruction`."""
 
 
 class Film:
-    """What a render has gathered so far. `render` makes one; `merge` adds another of the same picture."""
+    """The result of a render, to which further iterations can be added.
+
+    `render` returns one, `merge` adds another film of the same picture.
+    """
 
     AOV_NAMES = AOV_NAMES
 
-    def __init__(self, width: int, height: int, launcher: Launcher, frame: Any = None, *, glows: bool = True) -> None:
-        """An empty film on the launcher's device.
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        launcher: Launcher,
+        frame: DeviceFrame | None = None,
+        *,
+        has_emission: bool = True,
+    ) -> None:
+        """Makes an empty film on the launcher's device.
 
-        `frame` (a `DeviceFrame`) takes positions back to the world; `glows` says whether anything in view may emit.
+        Args:
+            width: Pixels across.
+            height: Pixels down.
+            launcher: Runs the film's kernels.
+            frame: Device frame of the scene, which takes positions and depths back to world space; None: they stay
+                as they are.
+            has_emission: Whether the camera may see emission.
         """
         self.width, self.height = width, height
         self.iterations = 0
-        """Iterations added; some may not have been for all tiles (`tile_iterations`)."""
+        """Iterations added; tiles that were not chosen have fewer (`tile_iterations`)."""
         self.seconds = 0.0
-        """Wall time of rendering them [s], without loading and compiling."""
+        """Wall time of rendering the iterations [s], without loading and compiling."""
         self.interrupted = 0
-        """Number of the signal that ended the render before its limit; 0: none did."""
-        self.settings: Any = None
-        """The `RenderSettings` it was rendered with."""
+        """Number of the signal that ended the render before its limit; 0: none."""
+        self.settings: RenderSettings | None = None
+        """The settings it was rendered with; None if it was loaded from a file."""
         self.timings: dict[str, float] = {}
-        """Seconds by phase; compiling and uploading belong to the first film after them."""
+        """Seconds by phase; the first film of a renderer includes compiling and uploading."""
         self.counts: dict[str, int] = {}
-        """Rays, VPLs, ... of all iterations."""
-        self.reconstruction: Any = None
-        """What filters the picture (a `Reconstruction`); None: the picture is the plain mean."""
-        self._resolved: tuple[int, Any] = (0, None)
-        self._denoised: tuple[int, Any] = (0, None)
-        self._frame = frame
+        """Numbers of rays, VPLs and others over all iterations."""
+        self.reconstruction: PictureFilter | None = None
+        """The filter of the picture; None: the picture is the unfiltered mean."""
+        self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them
+        self._denoised: tuple[int, Image] | None = None
+        self._frame = frame or DeviceFrame(np.zeros(3), 1.0)
         self._launcher = launcher
-        data = FilmData()
-        pixels = width * height
-        for name in (*_RADIANCE, "deviation", "albedo", "normal", "position"):
-            setattr(data, name, launcher.zeros(pixels if glows or name != "emission" else 0, wp.vec3))
-        data.depth = launcher.zeros(pixels, wp.float32)
-        for name in ("count", "hits", "rejected", "mesh"):
-            setattr(data, name, launcher.zeros(pixels, wp.int32))
-        self._data = data
+        self._data = new_film_data(width * height, has_emission, launcher)
         self._skipped: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
-        self.chosen = np.ones(len(self._skipped), bool)
-        """Which tiles of 8 x 8 pixels, row by row, the next iteration is for."""
-        self.tiles: Any = all_tiles(width, height, launcher)
-        """The same on the device."""
+        self.chosen: npt.NDArray[np.bool_] = np.ones(len(self._skipped), bool)
+        """[tiles], whether the next iteration is for a tile of 8 x 8 pixels; row by row."""
+        self.tiles: Tiles = all_tiles(width, height, launcher)
+        """The chosen tiles on the device."""
 
     def choose(self, tiles: npt.NDArray[np.bool_]) -> None:
-        """From now on iterations are for these tiles alone, bool [tiles]."""
+        """Restricts the following iterations to the tiles for which `tiles` [tiles] is true."""
         self.chosen = tiles
         self.tiles = some_tiles(tiles, self._skipped, self.width, self.height, self._launcher)
 
     @property
     def tile_iterations(self) -> npt.NDArray[np.int32]:
-        """How many iterations every tile of 8 x 8 pixels has had, [tiles], row by row."""
+        """Number of iterations of every tile of 8 x 8 pixels, [tiles], row by row."""
         return self.iterations - self._skipped
 
     def add(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
-        """Adds one iteration: a G-buffer that an estimator has filled, for one of the shutter samples."""
+        """Adds one iteration: a G-buffer that an estimator has filled, multiplied by `exposure`.
+
+        With motion blur, `shutter_sample` is the number of the shutter sample that it was made at.
+        """
         add_samples(gbuffer, exposure, self._data, self._launcher)
         if self.reconstruction is not None:
             self.reconstruction.accumulate(gbuffer, shutter_sample)
@@ -92,32 +125,33 @@ class Film:
             self.tiles.skipped = self._launcher.array(self._skipped, wp.int32)
 
     def merge(self, other: "Film") -> None:
-        """Adds another film of the same picture; that it used other iterations or another seed is up to you.
+        """Adds another film of the same picture, which must come from other iterations or another seed.
 
         Raises:
-            InputError: The films differ in size, or one shows what emits and the other does not.
+            InputError: The films differ in size, or only one of them stores emission.
         """
         if (self.width, self.height) != (other.width, other.height):
             raise InputError(f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels")
         if self._data.emission.shape != other._data.emission.shape:
-            raise InputError("film: cannot merge a film that shows what emits with one that does not")
+            raise InputError("film: cannot merge a film with emission and one without")
         if other.iterations == 0:
             return
         n, m = (film._data.count.numpy().astype(np.float64) for film in (self, other))
-        share = (m / np.maximum(n + m, 1.0))[:, None]  # the other's
-        apart = (self._sum(*_RADIANCE) - other._sum(*_RADIANCE)).astype(np.float64).reshape(-1, 3)
-        for name in FilmData.vars:
-            mine, theirs = (getattr(film._data, name).numpy() for film in (self, other))
+        weight = (m / np.maximum(n + m, 1.0))[:, None]  # of the other film
+        difference = (self._radiance_of(*_RADIANCE) - other._radiance_of(*_RADIANCE)).astype(np.float64).reshape(-1, 3)
+        others = film_arrays(other._data)
+        for name, array in film_arrays(self._data).items():
+            mine, theirs = array.numpy(), others[name].numpy()
             if name in _RADIANCE:
-                mine = mine + (theirs - mine) * share[: len(mine)]  # no rows of emission: there is none
-            elif name == "deviation":
+                mine = mine + (theirs - mine) * weight[: len(mine)]  # emission may have no rows
+            elif name == "standard_deviation":
                 mine, theirs = (x.astype(np.float64) ** 2 for x in (mine, theirs))
-                mine = np.sqrt(mine * (1.0 - share) + theirs * share + share * (1.0 - share) * apart**2)
+                mine = np.sqrt(mine * (1.0 - weight) + theirs * weight + weight * (1.0 - weight) * difference**2)
             elif name == "mesh":
                 mine = np.where(n > 0, mine, theirs)
             else:
                 mine = mine + theirs
-            getattr(self._data, name).assign(mine)
+            array.assign(mine)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self.iterations += other.iterations
@@ -128,71 +162,71 @@ class Film:
     def radiance(self) -> npt.NDArray[np.float32]:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
-        The mean of the iterations, its noise filtered or denoised if the settings say so.
+        The mean of the iterations, filtered or denoised if the settings say so.
         """
         pictures: list[Image] = []
         if self.reconstruction is not None and self.iterations > 0:
-            direct, indirect = self._reconstruct()[:2]
+            direct, indirect = self._reconstruct(self.reconstruction)[:2]
             pictures.append(direct + indirect)
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
             pictures.append(self._denoise().copy())
         if not pictures:
-            return self._sum(*_RADIANCE)
-        # What two unlike filters do wrong is hardly related: their mean has less error than the better of them.
+            return self._radiance_of(*_RADIANCE)
+        # The errors of the two filters are hardly correlated: the mean has less error than the better of them.
         return np.asarray(np.mean(pictures, axis=0)) if len(pictures) > 1 else pictures[0]
 
-    def _denoise(self) -> npt.NDArray[np.float32]:
-        """The denoised mean, computed once per iteration."""
-        if self._denoised[0] != self.iterations:
+    def _denoise(self) -> Image:
+        """The denoised mean, made once for a number of iterations."""
+        if self._denoised is None or self._denoised[0] != self.iterations:
             with self._launcher.phase("filter"):
                 if self.reconstruction is not None:
-                    albedo, normal, noisy = self._reconstruct()[2:]
+                    albedo, normal, noisy = self._reconstruct(self.reconstruction)[2:]
                 else:
-                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._sum(*_RADIANCE)
+                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._radiance_of(*_RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
                 limit = None if self.settings is None else self.settings.time_limit
                 picture = denoise(noisy, albedo, normal, clean, limit)
             self._denoised = (self.iterations, picture)
-        return np.asarray(self._denoised[1])
+        return self._denoised[1]
 
-    def _reconstruct(self) -> npt.NDArray[np.float32]:
-        """What `Reconstruction.resolve` makes of the film, computed once per iteration."""
-        if self._resolved[0] != self.iterations:
+    def _reconstruct(self, reconstruction: PictureFilter) -> npt.NDArray[np.float32]:
+        """The result of `Reconstruction.resolve`, made once for a number of iterations."""
+        if self._resolved is None or self._resolved[0] != self.iterations:
             features = self.settings is not None and self.settings.denoise
-            self._resolved = (self.iterations, self.reconstruction.resolve(self._data, self.iterations, features))
-        return np.asarray(self._resolved[1])
+            self._resolved = (self.iterations, reconstruction.resolve(self._data, self.iterations, features))
+        return self._resolved[1]
 
     def standard_error(self) -> npt.NDArray[np.float32]:
         """Standard error of `radiance` per pixel, float32 [height, width, 3]: √(se² + b²).
 
-        se is that of the plain mean, by the spread of its iterations. Those are independent but for the pixel's
-        stratified jitter: on edges the true error is smaller. What no iteration has met it cannot know: on the very
-        edge of a lamp, before the first sample that hits it, it is too small.
+        se is the standard error of the unfiltered mean, from the spread of its iterations. They are independent except
+        for the stratified pixel jitter: on edges the true error is smaller. What no iteration has hit is not in it: at
+        the edge of a lamp se is too small before the first sample hits the lamp.
 
-        b is the filter's bias, 0 without a filter: of the squared difference between its picture and the plain mean,
-        the share that is more than se² explains, over a tile of 8 x 8 pixels. The noise that the filter takes away is
-        not subtracted, since neighbours share what it leaves: where it works well, the error is about half of this.
-        What a denoiser does is not in it.
+        b is the bias of the filter, 0 without a filter: b² is the part of the squared difference between filtered and
+        unfiltered picture that exceeds se², over a tile of 8 x 8 pixels. The noise that the filter removes is not
+        subtracted, since the remaining noise is correlated between neighbours: where the filter works well, the true
+        error is about half of this. The error of a denoiser is not in it.
 
-        Infinite where there are fewer than two iterations.
+        Infinite where a pixel has fewer than two iterations.
         """
         n = self._data.count.numpy().reshape(self.height, self.width, 1)
-        error = self._sum("deviation") / np.sqrt(np.maximum(n - 1, 1), dtype=np.float32)
+        error = self._radiance_of("standard_deviation") / np.sqrt(np.maximum(n - 1, 1), dtype=np.float32)
         if self.reconstruction is not None and self.iterations > 1:
-            apart = self._apart()
-            noise, change = measure(self._data, self.tiles, self._floor(), self._launcher, apart)[:, 2:].T
-            share = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
-            tiles = share.astype(np.float32).reshape(-(-self.height // TILE), -1)
+            difference = self._filter_difference(self.reconstruction)
+            noise, change = self._tile_errors(difference)[:, 2:].T
+            bias_fraction = np.sqrt(1.0 - np.divide(noise, change, out=np.ones_like(noise), where=change > noise))
+            tiles = bias_fraction.astype(np.float32).reshape(-(-self.height // TILE), -1)
             pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: self.height, : self.width, None]
-            error = np.hypot(error, apart * pixels)
+            error = np.hypot(error, difference * pixels)
         return np.where(n > 1, error, np.float32(np.inf))
 
     def error(self) -> float:
-        """Estimated relative RMS error of the picture: √ of the mean of se² / (L² + 0.01 m²).
+        """Estimated relative RMS error of the picture: √ of the mean of (se² + b²) / (L² + 0.01 m²).
 
-        se is `standard_error`: if there is a filter, the picture has to be made for it, unless it has been. m is the
-        mean of the radiance L. Where L is uncertain, its neighbours' stands for it in part, if that is less: what is
-        bright by chance is off by more than its own brightness tells.
+        se and b are those of `standard_error`, m is the mean of the radiance L. With a filter the picture is made for
+        it, unless it has been made. Where L is uncertain, the denominator moves towards the smaller median of its
+        neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
 
         NaN with fewer than two iterations.
         """
@@ -201,153 +235,145 @@ class Film:
         return math.sqrt(self.squared_errors(filtered=True).sum())
 
     def squared_errors(self, *, filtered: bool = False) -> npt.NDArray[np.float64]:
-        """What every tile of 8 x 8 pixels has in the square of `error`, [tiles], row by row.
+        """Contribution of every tile of 8 x 8 pixels to the square of `error`, [tiles], row by row.
 
-        `filtered` says whether to make the picture and to add the filter's part.
+        `filtered` says whether to make the picture and to include the bias of the filter.
         """
-        wanted = filtered and self.reconstruction is not None and self.iterations > 1
-        apart = self._apart() if wanted else None
-        _, error, noise, change = measure(self._data, self.tiles, self._floor(), self._launcher, apart).T
+        difference = None
+        if filtered and self.reconstruction is not None and self.iterations > 1:
+            difference = self._filter_difference(self.reconstruction)
+        _, error, noise, change = self._tile_errors(difference).T
         return np.asarray((error + np.maximum(change - noise, 0.0)) / (3 * self.width * self.height))
 
-    def _apart(self) -> npt.NDArray[np.float32]:
-        """How far the filtered picture is off the plain mean, [height, width, 3]; 0 beside what emits.
+    def _tile_errors(self, filter_difference: Image | None) -> npt.NDArray[np.float64]:
+        """Sums of `tile_errors` over every tile, relative to L² + 0.01 m²."""
+        sums = tile_errors(self._data, self.tiles, 0.0, self._launcher)
+        mean = sums[:, 0].sum() / (3 * self.width * self.height)
+        return tile_errors(self._data, self.tiles, float(0.01 * mean**2), self._launcher, filter_difference)
 
-        There the filter has seen more of the pixel than the mean, by more camera rays.
+    def _filter_difference(self, reconstruction: PictureFilter) -> Image:
+        """Filtered picture minus unfiltered mean, [height, width, 3]; 0 at and next to pixels that see emission.
+
+        There the picture is made of more camera rays than the mean, so that the difference is no bias.
         """
-        apart = np.asarray(self._reconstruct()[:2].sum(axis=0) - self._sum(*_RADIANCE))
-        glows = np.pad(self._sum("emission").max(axis=-1) > 0.0, 1)
+        difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*_RADIANCE))
+        emissive = np.pad(self._radiance_of("emission").max(axis=-1) > 0.0, 1)
         for axis in (0, 1):
-            glows = glows | np.roll(glows, 1, axis) | np.roll(glows, -1, axis)
-        return np.where(glows[1:-1, 1:-1, None], np.float32(0.0), apart)
+            emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
+        return np.where(emissive[1:-1, 1:-1, None], np.float32(0.0), difference)
 
-    def _floor(self) -> float:
-        """0.01 m² of `error`."""
-        mean = measure(self._data, self.tiles, 0.0, self._launcher)[:, 0].sum() / (3 * self.width * self.height)
-        return float(0.01 * mean**2)
+    def aov(self, name: str) -> npt.NDArray[Any]:
+        """One of `AOV_NAMES`, row 0 at the top.
 
-    def aov(self, name: str) -> Image:
-        """One of `AOV_NAMES`.
-
-        "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance, unless it is
-        denoised. "albedo", "normal" (shading, unit), "position"
-        (world) [h, w, 3] and "depth" (along the view, scene units) [h, w] are means over the surface samples of the
-        pixel, 0 where there are none; "alpha" [h, w] is the covered share; "prim_id" int32 [h, w] the
-        index into `Scene.meshes` that the first iteration saw, -1 for the background.
+        "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance, unless it is denoised.
+        "albedo", "normal" (shading normal, unit), "position" (world space) [h, w, 3] and "depth" (along the camera's
+        axis, scene units) [h, w] are means over the surface samples of the pixel, 0 where there are none. "alpha"
+        [h, w] is the fraction of the samples that hit a surface. "prim_id" int32 [h, w] is the index into
+        `Scene.meshes` that the first iteration hit, -1 for the background.
 
         Raises:
             InputError: There is no such AOV.
         """
         shape = (self.height, self.width)
         if name in ("direct", "indirect") and self.reconstruction is not None and self.iterations > 0:
-            return self._reconstruct()[("direct", "indirect").index(name)]
+            return np.asarray(self._reconstruct(self.reconstruction)[("direct", "indirect").index(name)])
         if name == "direct":
-            return self._sum("emission", "direct")
+            return self._radiance_of("emission", "direct")
         if name == "indirect":
-            return self._sum("indirect")
+            return self._radiance_of("indirect")
         if name == "prim_id":
-            return self._data.mesh.numpy().reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
+            mesh = np.asarray(self._data.mesh.numpy())
+            return mesh.reshape(shape) if self.iterations else np.full(shape, -1, np.int32)
         hits = self._data.hits.numpy().reshape(shape)
         if name == "alpha":
             count = self._data.count.numpy().reshape(shape)
-            return (hits / np.maximum(count, 1)).astype(np.float32)
+            return np.asarray((hits / np.maximum(count, 1)).astype(np.float32))
         if name not in AOV_NAMES:
             raise InputError(f"aov: there is no {name!r}; there are {', '.join(AOV_NAMES)}")
-        total = getattr(self._data, name).numpy().astype(np.float64).reshape(*shape, -1)
-        seen = hits[..., None] > 0
-        mean = np.divide(total, hits[..., None], out=np.zeros_like(total), where=seen)
+        total = film_arrays(self._data)[name].numpy().astype(np.float64).reshape(*shape, -1)
+        covered = hits[..., None] > 0
+        mean = np.divide(total, hits[..., None], out=np.zeros_like(total), where=covered)
         if name == "normal":
             length = np.linalg.norm(mean, axis=-1, keepdims=True)
             mean = np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
-        if name == "position" and self._frame is not None:
-            mean = np.where(seen, self._frame.to_world(mean), 0.0)
+        if name == "position":
+            mean = np.where(covered, self._frame.to_world(mean), 0.0)
         if name == "depth":
-            mean = mean[..., 0] / (self._frame.scale if self._frame is not None else 1.0)
-        return mean.astype(np.float32)
+            mean = mean[..., 0] / self._frame.scale
+        return np.asarray(mean.astype(np.float32))
 
     @property
     def skipped(self) -> int:
-        """Samples of pixels that iterations have left out, their tiles being done."""
+        """Number of pixel samples that iterations have skipped, because their tiles were not chosen."""
         return self.iterations * self.width * self.height - int(self._data.count.numpy().sum(dtype=np.int64))
 
     @property
     def rejected(self) -> int:
-        """Samples that were not finite and count as black; 0 unless something is wrong."""
+        """Number of samples that were not finite and count as black; 0 unless something is wrong."""
         return int(self._data.rejected.numpy().sum())
 
     def save(self, path: str | os.PathLike[str], key: str = "") -> None:
-        """Writes the film, sums and all, as .npz: `load` and `resume` give it back bit for bit.
+        """Writes the film and the samples of its filter as .npz; `load` and `resume` restore it bit for bit.
 
         Args:
             path: The file.
-            key: Says what it is a film of; `resume` compares it.
+            key: Identifies the scene and the settings; `resume` compares it.
         """
-        arrays = {name: getattr(self._data, name).numpy() for name in FilmData.vars}
-        if self.reconstruction is not None:
-            arrays |= {_SEEN + name: array.numpy() for name, array in self.reconstruction.arrays().items()}
-        origin, scale = (self._frame.origin, self._frame.scale) if self._frame is not None else (np.zeros(3), 1.0)
-        arrays |= {"origin": origin, "scale": scale, "chosen": self.chosen, "seconds": self.seconds}
-        with open(path, "wb") as file:
-            np.savez(file, key=key, size=np.array([self.width, self.height, self.iterations]), **arrays)
+        state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame)
+        write_film(path, state, self._saved_arrays())
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
-        """Goes on where a film was when `save` wrote it: this one, empty and of the same scene, becomes that one.
+        """Restores a film that `save` wrote into this one, which must be empty and of the same scene.
 
         Raises:
-            InputError: The file is missing, is no film, or is one of something else.
+            InputError: The file is missing, is no film, or is one of another scene or size.
         """
-        wanted = {name: getattr(self._data, name) for name in FilmData.vars}
-        if self.reconstruction is not None:
-            wanted |= {_SEEN + name: array for name, array in self.reconstruction.arrays().items()}
-        about = _read(path, ["key", "size", "seconds", "chosen"])
-        if str(about["key"]) != key or about["size"][:2].tolist() != [self.width, self.height]:
+        state = read_state(path)
+        if state.key != key or (state.width, state.height) != (self.width, self.height):
             raise InputError(f"{os.fspath(path)}: a film of another scene, or with other settings")
-        arrays = _read(path, [*wanted])
-        if any(arrays[name].shape[0] != array.shape[0] for name, array in wanted.items()):
+        arrays = self._saved_arrays()
+        stored = read_arrays(path, arrays)
+        if any(stored[name].shape[0] != array.shape[0] for name, array in arrays.items()):
             raise InputError(f"{os.fspath(path)}: not a film: its arrays differ in size")
-        for name, array in wanted.items():
-            array.assign(arrays[name])
-        self.iterations, self.seconds = int(about["size"][2]), float(about["seconds"])
-        self._take_tiles(about["chosen"])
+        self._restore(state, arrays, stored)
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
-        """Reads a film that `save` wrote.
+        """Reads a film that `save` wrote, without its filter: its picture is the unfiltered mean.
 
         Raises:
             InputError: The file is missing or is no film.
         """
-        from warp_ir.device_scene import DeviceFrame
-
-        arrays = _read(path, [*FilmData.vars, "size", "seconds", "chosen", "origin", "scale"])
-        width, height, iterations = (int(x) for x in arrays["size"])
-        frame = DeviceFrame(arrays["origin"], float(arrays["scale"]))
-        film = Film(width, height, Launcher(device), frame, glows=len(arrays["emission"]) > 0)
-        film.iterations, film.seconds = iterations, float(arrays["seconds"])
-        for name in FilmData.vars:
-            getattr(film._data, name).assign(arrays[name])
-        film._take_tiles(arrays["chosen"])
+        state = read_state(path)
+        stored = read_arrays(path, FIELDS)
+        has_emission = len(stored["emission"]) > 0
+        film = Film(state.width, state.height, Launcher(device), state.frame, has_emission=has_emission)
+        film._restore(state, film_arrays(film._data), stored)
         return film
 
-    def _take_tiles(self, chosen: npt.NDArray[np.bool_]) -> None:
-        """Finds out how many iterations have left out each tile; chooses those of the next."""
+    def _saved_arrays(self) -> "dict[str, wp.array[Any]]":
+        """The arrays of the film and of its filter, by their names in a file."""
+        arrays = film_arrays(self._data)
+        if self.reconstruction is not None:
+            arrays |= reconstruction_names(self.reconstruction.arrays())
+        return arrays
+
+    def _restore(
+        self, state: FilmState, arrays: "dict[str, wp.array[Any]]", stored: dict[str, npt.NDArray[Any]]
+    ) -> None:
+        """Copies stored arrays into those of the same name, and takes over the rest of the state."""
+        for name, array in arrays.items():
+            array.assign(stored[name])
+        self.iterations, self.seconds = state.iterations, state.seconds
         count = self._data.count.numpy().reshape(self.height, self.width)
         self._skipped = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
-        self.choose(chosen)
+        self.choose(state.chosen)
 
-    def _sum(self, *names: str) -> npt.NDArray[np.float32]:
-        """The sum of some tables, float32 [height, width, 3]; never a view of one."""
+    def _radiance_of(self, *names: str) -> npt.NDArray[np.float32]:
+        """Sum of some fields of `FilmData`, float32 [height, width, 3]; always a copy."""
         total = np.zeros((self.width * self.height, 3), np.float32)
+        arrays = film_arrays(self._data)
         for name in names:
             if name != "emission" or self._data.emission.shape[0] > 0:
-                total += getattr(self._data, name).numpy()
+                total += arrays[name].numpy()
         return total.reshape(self.height, self.width, 3)
-
-
-def _read(path: str | os.PathLike[str], names: Sequence[str]) -> dict[str, Any]:
-    """Arrays of a file that `Film.save` wrote."""
-    try:
-        with open(path, "rb") as stream, np.load(stream) as file:
-            return {name: file[name] for name in names}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{os.fspath(path)}: not a film: {error}") from error

@@ -1,4 +1,4 @@
-"""Pictures as arrays and files: writing and reading them, tone mapping, colour spaces, smaller copies."""
+"""Pictures as arrays and files: reading and writing, tone mapping, colour spaces, and mip chains."""
 
 from warp_ir.image.io import read_image, write_image
 

@@ -1,7 +1,7 @@
-"""The linear colour spaces that pictures are written in; light is computed in linear Rec. 709.
+"""Linear colour spaces in which pictures are written; rendering is in linear Rec. 709.
 
-A space is its primaries and its white point. Between white points colours are adapted as by Bradford, so that white
-stays white. Names are those of USD's GfColorSpace, which are the Color Interop Forum's.
+A space is defined by its primaries and its white point. The Bradford transform adapts colours between white points, so
+that white stays white. The names are those of the Color Interop Forum, as in USD's GfColorSpace.
 """
 
 import functools
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
-"""x and y of red, green, blue and white."""
+"""CIE xy of red, green, blue and white."""
 
 _D65 = (0.3127, 0.3290)
 _ACES_WHITE = (0.32168, 0.33767)
@@ -23,13 +23,13 @@ COLOR_SPACES: dict[str, Chromaticities] = {
     "lin_p3d65_scene": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65),
     "lin_adobergb_scene": (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, *_D65),
 }
-"""Those that can be named; the first is that of the renderer."""
+"""The known colour spaces by name; the first is that of the renderer."""
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-"""From XYZ to the responses of cones, Lam 1985."""
+"""From XYZ to cone responses (Lam 1985)."""
 
 
 def from_rec709(colors: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.float32]:
-    """Linear Rec. 709 colours [..., 3] in another linear space."""
+    """Converts linear Rec. 709 colours [..., 3] to the linear space `name`."""
     if name == REC709:
         return np.asarray(colors, np.float32)
     converted: npt.NDArray[np.float32] = (colors @ matrix(name).T).astype(np.float32)
@@ -38,12 +38,12 @@ def from_rec709(colors: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.f
 
 @functools.cache
 def matrix(name: str) -> npt.NDArray[np.float64]:
-    """What takes colours from linear Rec. 709 to another linear space, [3, 3], to be multiplied by columns."""
+    """Matrix [3, 3] that takes linear Rec. 709 colours, as columns, to the linear space `name`."""
     return np.asarray(np.linalg.solve(_xyz_d65_from(name), _xyz_d65_from(REC709)), np.float64)
 
 
 def _xyz_d65_from(name: str) -> npt.NDArray[np.float64]:
-    """XYZ, adapted to the white D65, from a linear space."""
+    """Matrix [3, 3] from a linear space to XYZ, adapted to D65."""
     *primaries, white_x, white_y = COLOR_SPACES[name]
     columns = np.stack([_xyz(x, y) for x, y in zip(primaries[::2], primaries[1::2], strict=True)], axis=1)
     white = _xyz(white_x, white_y)
@@ -54,5 +54,5 @@ def _xyz_d65_from(name: str) -> npt.NDArray[np.float64]:
 
 
 def _xyz(x: float, y: float) -> npt.NDArray[np.float64]:
-    """The colour of a chromaticity with luminance 1; for y = 0 or below as well, up to its sign."""
+    """XYZ of a chromaticity with Y = 1, or with Y = 0 if y is 0."""
     return np.array([x, y, 1.0 - x - y]) / (y if y else 1.0)

@@ -1,6 +1,6 @@
-"""Pictures on disk: a film or an array in, a file out, whole or not at all.
+"""Reading and writing pictures; a file is written completely or not at all.
 
-`.exr` `.hdr` `.pfm` and `.npy` hold linear radiance; `.png` and `.jpg` what a screen shows of it.
+`.exr`, `.hdr`, `.pfm` and `.npy` hold linear radiance, `.png` and `.jpg` tone-mapped display values.
 """
 
 import os
@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ import numpy.typing as npt
 from warp_ir.image.color_space import COLOR_SPACES, REC709, from_rec709
 from warp_ir.image.tonemap import srgb_from_linear, tone_map
 from warp_ir.scene import InputError
+
+if TYPE_CHECKING:
+    import OpenImageIO as oiio
 
 Array = npt.NDArray[np.floating]
 
@@ -29,34 +32,47 @@ AOV_CHANNELS = {
     "alpha": ("A",),
     "prim_id": ("prim_id",),
 }
-"""The channels of an EXR file that hold a film's AOVs; the colour itself is R, G, B and A."""
+"""Channels of an EXR file that hold the AOVs of a film; its radiance is in R, G and B."""
 
 SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg")
-"""The kinds of picture that can be written."""
+"""Extensions of the pictures that can be written."""
 
 _HALF_MAX = 65504.0
-_EXACT = frozenset({"position", "depth", "prim_id"})
-"""AOVs that keep 32 bits in a half-float file: 11 bits are no distance and no name."""
+_FULL_FLOAT_AOVS = frozenset({"position", "depth", "prim_id"})
+"""AOVs that a half-float file stores with 32 bits: 11 bits of precision are too few for distances and indices."""
 _COLORS = frozenset({None, "direct", "indirect", "albedo"})
-"""AOVs that are colours; None is the picture itself."""
+"""AOVs that are colours; None stands for the radiance."""
 
 
-_Layers = dict[str, tuple[Array, bool]]
+_Channels = dict[str, tuple[Array, bool]]
 """Channels of an EXR file: name -> values, float32 [h, w], and whether they need 32 bits."""
 
 
-class _Film(Protocol):
-    """What is needed of a `Film` here."""
+class _Settings(Protocol):
+    """What this module requires of `RenderSettings`."""
 
     @property
-    def settings(self) -> Any: ...
+    def color_space(self) -> str: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int | None: ...
+    def pixels(self) -> tuple[int, int, int, int]: ...
+    def to_dict(self) -> dict[str, Any]: ...
+
+
+class _Film(Protocol):
+    """What this module requires of a `Film`."""
+
+    @property
+    def settings(self) -> _Settings | None: ...
     @property
     def iterations(self) -> int: ...
     @property
     def seconds(self) -> float: ...
-    def radiance(self) -> Any: ...
+    def radiance(self) -> npt.NDArray[np.float32]: ...
     def error(self) -> float: ...
-    def aov(self, name: str) -> Any: ...
+    def aov(self, name: str) -> npt.NDArray[Any]: ...
 
 
 def write_image(
@@ -71,55 +87,56 @@ def write_image(
     metadata: Mapping[str, object] | None = None,
     color_space: str | None = None,
 ) -> list[Path]:
-    """Writes a picture; the extension says how.
+    """Writes a picture in the format of the file's extension.
 
     Args:
-        path: `.exr` (colour, alpha, AOVs, metadata), `.hdr`, `.pfm`, `.npy` (linear), `.png`, `.jpg`
-            (tone-mapped). An existing file is replaced.
-        source: A film, or an array [h, w], [h, w, 1], [h, w, 3] or [h, w, 4] (with alpha, and the
-            colour premultiplied by it), row 0 at the top.
-        exposure: Stops; for `.png` and `.jpg` only.
+        path: `.exr` (colour, alpha, AOVs, metadata), `.hdr`, `.pfm`, `.npy` (linear), `.png` or `.jpg` (tone-mapped).
+            An existing file is replaced.
+        source: A film, or an array [h, w], [h, w, 1], [h, w, 3] or [h, w, 4] (colour premultiplied by alpha) in
+            linear Rec. 709, row 0 at the top.
+        exposure: Exposure [stops]; for `.png` and `.jpg` only.
         tonemap: "srgb" or "filmic"; for `.png` and `.jpg` only.
         aov: Name of the film's AOV to write in place of its radiance.
-        aovs: Further AOVs of the film. In an EXR file they are layers of the same file; beside any
-            other picture.png there will be a picture.NAME.png of each.
+        aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
+            to a file of its own: picture.NAME.png for picture.png.
         half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped.
-        metadata: More attributes for an EXR file, beside the film's settings and statistics.
-        color_space: One of `COLOR_SPACES`, in which colours are written where they stay linear; None: that of the
-            film's settings, else linear Rec. 709, which arrays and films are in.
+        metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
+        color_space: One of `COLOR_SPACES`, for colours in the linear formats; None: that of the film's settings, or
+            linear Rec. 709 for an array.
 
     Returns:
-        The files written.
+        The paths of the written files.
 
     Raises:
         InputError: The path cannot be written, or the extension, AOV, tone curve or colour space is unknown.
     """
     path = check_output(path)
     if color_space is None:
-        color_space = getattr(getattr(source, "settings", None), "color_space", REC709)
+        settings = None if isinstance(source, np.ndarray) else source.settings
+        color_space = REC709 if settings is None else settings.color_space
     if color_space not in COLOR_SPACES:
         raise InputError(f"{path}: no colour space {color_space!r}; known are {', '.join(COLOR_SPACES)}")
     suffix = path.suffix.lower()
     if isinstance(source, np.ndarray) and (aov or aovs):
         raise InputError(f"{path}: an array has no AOVs; write a film")
     if suffix == ".exr":
-        layers = _exr_layers(source, aov, aovs, color_space)
+        channels = _exr_channels(source, aov, aovs, color_space)
         attributes = {**_attributes(source, metadata or {}), "colorInteropID": color_space}
-        _write_exr(path, layers, half, attributes, COLOR_SPACES[color_space], _windows(source))
+        _write_exr(path, channels, half, attributes, COLOR_SPACES[color_space], _data_window(source))
         return [path]
-    _write_flat(path, source, exposure, tonemap, aov, color_space)
-    beside = [aov_path(path, name) for name in aovs]
-    for name, other in zip(aovs, beside, strict=True):
-        _write_flat(other, source, exposure, tonemap, name, color_space)
-    return [path, *beside]
+    _write_single_layer(path, source, exposure, tonemap, aov, color_space)
+    aov_paths = [aov_path(path, name) for name in aovs]
+    for name, other in zip(aovs, aov_paths, strict=True):
+        _write_single_layer(other, source, exposure, tonemap, name, color_space)
+    return [path, *aov_paths]
 
 
 def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.NDArray[np.float32]:
-    """Reads a picture as it was stored (8-bit values as 0 to 1, not linearised), float32 [h, w, c].
+    """Reads the stored values of a picture, float32 [h, w, c]; 8-bit values become 0 to 1, and are not linearised.
 
     Args:
-        path: Any of `SUFFIXES`, or whatever else OpenImageIO reads.
-        layer: Name of an AOV in an EXR file; by default the colour, with alpha if there is one.
+        path: A file of any of `SUFFIXES`, or of another format that OpenImageIO reads.
+        layer: Name of an AOV in an EXR file; None: the colour, with alpha if there is one.
 
     Raises:
         InputError: The file cannot be read, or lacks the layer.
@@ -135,7 +152,7 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
         return values[..., None] if values.ndim == 2 else values
     import OpenImageIO as oiio
 
-    # Values are given back as stored: no reader may multiply colour by alpha.
+    # Stored values are wanted: no reader may multiply colour by alpha.
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
@@ -155,22 +172,25 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
 
 
 def aov_path(path: Path, aov: str) -> Path:
-    """The file beside `path` that holds an AOV, where the format has no layers: a.png -> a.depth.png."""
+    """Path of an AOV of `path` in a format without layers: a.png -> a.depth.png."""
     return path.with_name(f"{path.stem}.{aov}{path.suffix}")
 
 
 def check_output(
     path: str | os.PathLike[str], suffixes: Sequence[str] = SUFFIXES, *, make_folder: bool = False
 ) -> Path:
-    """Makes sure, before any work is done, that a file can be written.
+    """Checks that a file can be written, before any work is done for it.
 
     Args:
-        path: The file to be written.
-        suffixes: The extensions that are known, in lower case.
-        make_folder: Whether to create the folder it is in.
+        path: The file to write.
+        suffixes: The known extensions, in lower case.
+        make_folder: Whether to create the file's folder.
+
+    Returns:
+        The path.
 
     Raises:
-        InputError: It cannot.
+        InputError: The file cannot be written.
     """
     path = Path(path)
     try:
@@ -188,7 +208,7 @@ def check_output(
             path.parent.mkdir(parents=True, exist_ok=True)
         elif not path.parent.exists():
             raise InputError(f"{path}: there is no folder {str(path.parent)!r}")
-        # Permissions, read-only and full file systems: the one way to know is to try.
+        # Permissions, read-only and full file systems show only when a file is created.
         temporary = _temporary(path)
         temporary.open("xb").close()
         temporary.unlink()
@@ -201,12 +221,12 @@ def check_output(
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Gives a temporary path in the same folder; on success it becomes `path`, otherwise it vanishes.
+    """Yields a temporary path in the same folder, which replaces `path` on success and is removed otherwise.
 
     Raises:
         InputError: Writing failed.
     """
-    # A link is followed, so that what it points to is replaced and not the link.
+    # A link is followed: its target is replaced, and not the link.
     target = Path(os.path.realpath(path))
     temporary = _temporary(target)
     try:
@@ -220,12 +240,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> Path:
-    """A hidden name in the same folder, of the same extension, that no other process uses."""
+    """A hidden path in the same folder, with the same extension, that no other process uses."""
     return path.with_name(f".warp-ir-{os.getpid()}-{os.urandom(4).hex()}{path.suffix}")
 
 
 def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | None]:
-    """Values, float32 [h, w, c], and alpha, float32 [h, w, 1], or None if everything is opaque."""
+    """Values, float32 [h, w, c], and alpha, float32 [h, w, 1]; None without alpha."""
     alpha: Array | None = None
     if isinstance(source, np.ndarray):
         values = source
@@ -245,27 +265,29 @@ def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | No
 
 
 def _linear(values: Array, aov: str | None, color_space: str) -> Array:
-    """Values as they are stored where they stay linear: colours in a colour space, others as they are."""
+    """Values as linear formats store them: colours in the given colour space, others unchanged."""
     return from_rec709(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
 
 
-def _exr_layers(source: "_Film | Array", aov: str | None, aovs: Sequence[str], color_space: str) -> _Layers:
+def _exr_channels(source: "_Film | Array", aov: str | None, aovs: Sequence[str], color_space: str) -> _Channels:
+    """Channels of an EXR file with the picture, alpha and AOVs."""
     values, alpha = _pixels(source, aov)
     values = _linear(values, aov, color_space)
     names: Sequence[str] = ("R", "G", "B")
     if values.shape[2] == 1:
         names = AOV_CHANNELS[aov] if aov else ("Y",)
-    layers = {name: (values[..., k], aov in _EXACT) for k, name in enumerate(names)}
+    channels = {name: (values[..., k], aov in _FULL_FLOAT_AOVS) for k, name in enumerate(names)}
     if alpha is not None:
-        layers["A"] = (alpha[..., 0], False)
+        channels["A"] = (alpha[..., 0], False)
     for name in aovs:
         values = _linear(_pixels(source, name)[0], name, color_space)
-        layers |= {channel: (values[..., k], name in _EXACT) for k, channel in enumerate(AOV_CHANNELS[name])}
-    return layers
+        full_float = name in _FULL_FLOAT_AOVS
+        channels |= {channel: (values[..., k], full_float) for k, channel in enumerate(AOV_CHANNELS[name])}
+    return channels
 
 
-def _windows(source: "_Film | Array") -> tuple[int, int, int, int] | None:
-    """Where a film's pixels belong: left column and top row in an image of so many columns and rows."""
+def _data_window(source: "_Film | Array") -> tuple[int, int, int, int] | None:
+    """Left column and top row of a film in the whole image, and the columns and rows of that; None: it is the whole."""
     settings = None if isinstance(source, np.ndarray) else source.settings
     if settings is None or settings.height is None:
         return None
@@ -275,35 +297,36 @@ def _windows(source: "_Film | Array") -> tuple[int, int, int, int] | None:
 
 def _write_exr(
     path: Path,
-    layers: _Layers,
+    channels: _Channels,
     half: bool,
-    attributes: dict[str, Any],
+    attributes: Mapping[str, str | float],
     chromaticities: Sequence[float],
-    windows: tuple[int, int, int, int] | None,
+    window: tuple[int, int, int, int] | None,
 ) -> None:
+    """Writes an EXR file; `window` is a `_data_window`."""
     import OpenImageIO as oiio
 
-    formats = [oiio.HALF if half and not exact else oiio.FLOAT for _, exact in layers.values()]
+    formats = [oiio.HALF if half and not full_float else oiio.FLOAT for _, full_float in channels.values()]
     planes = [
         np.clip(plane, -_HALF_MAX, _HALF_MAX) if stored == oiio.HALF else plane
-        for (plane, _), stored in zip(layers.values(), formats, strict=True)
+        for (plane, _), stored in zip(channels.values(), formats, strict=True)
     ]
     pixels = np.stack(planes, axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])
     spec.channelformats = tuple(formats)
-    spec.channelnames = tuple(layers)
-    if windows is not None:
-        spec.x, spec.y, spec.full_width, spec.full_height = windows
+    spec.channelnames = tuple(channels)
+    if window is not None:
+        spec.x, spec.y, spec.full_width, spec.full_height = window
     for name, value in attributes.items():
         spec.attribute(name, value)
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(chromaticities))
     _save(path, spec, pixels)
 
 
-def _write_flat(
+def _write_single_layer(
     path: Path, source: "_Film | Array", exposure: float, tonemap: str, aov: str | None, color_space: str
 ) -> None:
-    """A file without layers: the linear formats, and those for a screen."""
+    """Writes a file of a format without layers."""
     values, alpha = _pixels(source, aov)
     suffix = path.suffix.lower()
     if suffix in (".npy", ".hdr", ".pfm"):
@@ -315,12 +338,12 @@ def _write_flat(
     import OpenImageIO as oiio
 
     if suffix in (".hdr", ".pfm"):
-        if suffix == ".hdr":  # three channels, none of them negative
+        if suffix == ".hdr":  # stores three channels, which are not negative
             values = np.maximum(np.broadcast_to(values, (*values.shape[:2], 3)), 0.0)
         _save(path, oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], oiio.FLOAT), values)
         return
     if suffix == ".png" and alpha is not None:
-        # PNG wants colour that is not multiplied by alpha. JPEG has no alpha: the picture is over black.
+        # PNG stores unassociated alpha. JPEG has no alpha: premultiplied colour is the picture over black.
         values = np.divide(values, alpha, out=np.zeros_like(values), where=alpha > 0.0)
     shown = _display(values, aov, exposure, tonemap)
     if suffix == ".png" and alpha is not None:
@@ -334,7 +357,7 @@ def _write_flat(
 
 
 def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> Array:
-    """What a screen shows of a colour or an AOV: values in [0, 1]."""
+    """Display values in [0, 1] of the radiance or an AOV."""
     if aov in (None, "direct", "indirect"):
         return tone_map(values, exposure, tonemap)
     if aov == "albedo":
@@ -349,16 +372,18 @@ def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> A
     return shown
 
 
-def _save(path: Path, spec: Any, pixels: npt.NDArray[Any]) -> None:
-    """Lets OpenImageIO write the pixels; every way to fail is an `InputError`."""
+def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.uint8]") -> None:
+    """Writes pixels with OpenImageIO; raises `InputError` if that fails in any way."""
     import OpenImageIO as oiio
 
     if path.suffix.lower() in (".jpg", ".jpeg") and shutil.disk_usage(path.parent).free < 2 * pixels.nbytes:
-        # libjpeg ends the process when it cannot write.
+        # libjpeg exits the process when it cannot write.
         raise InputError(f"{path}: cannot be written: no space left on the device")
     with whole_file(path) as temporary:
-        writer: Any = oiio.ImageOutput.create(str(temporary))
-        # All three are called: close() flushes, and geterror() knows of failures that they do not report.
+        writer = oiio.ImageOutput.create(str(temporary))
+        if writer is None:
+            raise OSError(_first_line(oiio.geterror()))
+        # close() flushes, and geterror() tells of failures that the other calls do not report.
         good = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
         good = writer.close() and good
         message = writer.geterror()
@@ -366,16 +391,16 @@ def _save(path: Path, spec: Any, pixels: npt.NDArray[Any]) -> None:
             raise OSError(_first_line(message) or "unknown error")
 
 
-def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict[str, Any]:
-    """EXR attributes; names get the prefix `warp_ir:`, values become whatever OpenImageIO stores."""
+def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict[str, str | float]:
+    """EXR attributes with the prefix `warp_ir:`, converted to types that OpenImageIO stores."""
     from warp_ir import __version__
 
     known: dict[str, object] = {}
     if not isinstance(source, np.ndarray):
-        known = {} if source.settings is None else source.settings.to_dict()  # a loaded film has none
+        known = {} if source.settings is None else source.settings.to_dict()  # None: a loaded film
         known |= {"iterations": source.iterations, "seconds": source.seconds}
         known["estimated_error"] = source.error()
-    attributes: dict[str, Any] = {"Software": f"warp_ir {__version__}"}
+    attributes: dict[str, str | float] = {"Software": f"warp_ir {__version__}"}
     for name, value in {**known, **metadata}.items():
         if name == "pixel_aspect":
             attributes["PixelAspectRatio"] = float(str(value))
@@ -389,7 +414,7 @@ def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict
 
 
 def _reason(error: Exception) -> str:
-    """An error in a few words, without the path that the message names already."""
+    """The reason of an error, without the path, which the message names already."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return _first_line(str(error))

@@ -1,4 +1,4 @@
-"""Images made smaller without changing their mean."""
+"""Mip chains and resampling of images; every level has the exact mean of the image."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from warp_ir.scene import Floats
 
 
 def mip_chain(pixels: Floats) -> list[Floats]:
-    """The image [h, w, c] and ever smaller ones, down to one pixel, all of the same mean."""
+    """The levels of a mip chain: the image [h, w, c], then half the size each, down to one pixel."""
     chain = [np.asarray(pixels, np.float32)]
     while max(chain[-1].shape[:2]) > 1:
         height, width = (max(n // 2, 1) for n in chain[-1].shape[:2])
@@ -15,7 +15,7 @@ def mip_chain(pixels: Floats) -> list[Floats]:
 
 
 def resized(pixels: Floats, height: int, width: int) -> Floats:
-    """Means [height, width, c] over equal parts of an image, pixels on their borders shared in proportion."""
+    """Resamples an image to [height, width, c] with a box filter; pixels on its border count in proportion."""
     h, w = pixels.shape[:2]
     if (h, w) == (2 * height, 2 * width):
         quarters = pixels.reshape(height, 2, width, 2, -1)
@@ -25,11 +25,11 @@ def resized(pixels: Floats, height: int, width: int) -> Floats:
         count = out.shape[axis]
         if count == size:
             continue
-        # Differences of the integral, which is linear between the pixels' edges.
+        # Box means are differences of the integral, which is linear between the pixels' edges.
         sums = np.concatenate([np.zeros_like(np.take(out, [0], axis)), np.cumsum(out, axis=axis)], axis=axis)
         edges = np.arange(size + 1) * (count / size)
         below = np.minimum(edges.astype(np.int64), count - 1)
-        rest = (edges - below).reshape([-1 if k == axis else 1 for k in range(out.ndim)])
-        integral = np.take(sums, below, axis) + rest * np.take(out, below, axis)
+        fraction = (edges - below).reshape([-1 if k == axis else 1 for k in range(out.ndim)])
+        integral = np.take(sums, below, axis) + fraction * np.take(out, below, axis)
         out = np.diff(integral, axis=axis) * (size / count)
     return out.astype(np.float32)

@@ -1,6 +1,6 @@
-"""From linear radiance to what a screen shows: exposure, a tone curve, the sRGB transfer function.
+"""Tone mapping, from linear radiance to display values: exposure, a tone curve, the sRGB transfer function.
 
-Everything here is pure NumPy on arrays of any shape, and works channel by channel.
+All functions work channel by channel on NumPy arrays of any shape, except those of luminance.
 """
 
 from collections.abc import Callable
@@ -18,18 +18,18 @@ _MIDDLE_GREY = 0.18
 
 
 def srgb_from_linear(linear: Array) -> Array:
-    """The sRGB transfer function, exactly as IEC 61966-2-1 has it; clips to [0, 1]."""
+    """The sRGB transfer function of IEC 61966-2-1; clips to [0, 1]."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
 
 def filmic(linear: Array) -> Array:
-    """The curve that Narkowicz (2015, "ACES Filmic Tone Mapping Curve") fitted to the ACES reference.
+    """Fit of the ACES filmic tone curve by Narkowicz (2015, "ACES Filmic Tone Mapping Curve"); linear, in [0, 1].
 
-    A toe, a nearly straight middle and a shoulder that reaches 1 near a radiance of 8: highlights roll
-    off where `srgb_from_linear` alone would clip them at 1. The result is linear, in [0, 1].
+    Its shoulder reaches 1 near a radiance of 8, so that highlights are compressed where `srgb_from_linear` alone
+    would clip them at 1.
     """
-    # Beyond the shoulder the curve is flat; the bound keeps the squares of huge radiances finite.
+    # The curve is flat above the shoulder; the bound keeps the squares of huge radiances finite.
     x = np.clip(linear, 0.0, 1e3)
     return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
 
@@ -44,8 +44,8 @@ def tone_map(radiance: Array, exposure: float = 0.0, tonemap: str = "srgb") -> A
 
     Args:
         radiance: Linear, any shape.
-        exposure: Stops: every whole one doubles the radiance first.
-        tonemap: "srgb" (no curve, clips at 1) or "filmic".
+        exposure: Exposure [stops]; the radiance is multiplied by 2 to this power.
+        tonemap: "srgb" (no tone curve, clips at 1) or "filmic".
 
     Raises:
         InputError: There is no such tone curve, or the exposure is not a number within ±1000 stops.
@@ -60,27 +60,28 @@ def tone_map(radiance: Array, exposure: float = 0.0, tonemap: str = "srgb") -> A
 
 
 def luminance(radiance: Array) -> Array:
-    """Luminance of linear Rec. 709 colours, shape [..., 3] to [...]."""
+    """Luminance [...] of linear Rec. 709 colours [..., 3]."""
     return radiance @ _LUMINANCE.astype(radiance.dtype)
 
 
 def suggest_exposure(radiance: Array, exposure: float = 0.0) -> float | None:
-    """The exposure [stops] that would show a picture properly, if `exposure` shows it almost white or black.
+    """Suggests an exposure [stops] for a picture that `exposure` shows almost white or almost black.
 
-    The suggestion takes the log-average luminance to middle grey (Reinhard et al. 2002). A picture that
-    is shown well enough gives None, and so does one that is black throughout.
+    The suggestion maps the log-average luminance to middle grey (Reinhard et al. 2002), in steps of half a stop. None
+    if the mean display value is between 4 % and 96 %, or the picture is entirely black.
 
     Args:
         radiance: Linear, shape [..., 3].
-        exposure: Stops that the picture is shown with.
+        exposure: Exposure with which the picture is shown [stops].
     """
-    # In float64, and in log2: neither the exposure nor the picture can overflow.
-    lit = luminance(np.asarray(radiance, dtype=np.float64))
-    lit = lit[lit > 0.0]
-    if lit.size == 0:
+    # Float64 and log2 prevent overflow of exposure and picture.
+    positive = luminance(np.asarray(radiance, dtype=np.float64))
+    positive = positive[positive > 0.0]
+    if positive.size == 0:
         return None
-    shown = float(np.mean(srgb_from_linear(np.exp2(np.clip(np.log2(lit) + exposure, -64.0, 64.0)))))
+    log_luminance = np.log2(positive)
+    shown = float(np.mean(srgb_from_linear(np.exp2(np.clip(log_luminance + exposure, -64.0, 64.0)))))
     if 0.04 < shown < 0.96:
         return None
-    # To half a stop, and never a negative zero.
-    return round(2.0 * float(np.log2(_MIDDLE_GREY) - np.mean(np.log2(lit)))) / 2.0 + 0.0
+    # Adding zero turns a negative zero into a positive one.
+    return round(2.0 * float(np.log2(_MIDDLE_GREY) - np.mean(log_luminance))) / 2.0 + 0.0

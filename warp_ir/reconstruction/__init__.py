@@ -1,15 +1,16 @@
-"""The picture from few samples: irradiance is filtered on surfaces, edges are sampled apart from it.
+"""Reconstruction of the picture from few samples: irradiance is filtered on surfaces, edges are supersampled.
 
-A pixel stands for the surface seen through its centre (`surfaces.py`). Samples of irradiance that fall on it are
-averaged there (`observations.py`) and filtered (`filter.py`): no pixel mixes surfaces, so edges do not stop the filter.
-What a pixel on an edge shows is then found by many cheap camera rays, each taking the irradiance of the neighbouring
-pixel whose surface it meets (`edges.py`).
+A pixel stands for the surface that is visible through its centre (`pixel_surfaces.py`). Samples of irradiance on that
+surface are accumulated there (`sample_buffer.py`) and denoised by a variance-guided à-trous filter (`filter.py`). No
+pixel mixes surfaces, so geometric edges do not stop the filter. Pixels on edges are supersampled: many cheap camera
+rays, each of which takes the filtered irradiance of the neighbouring pixel whose surface it hits (`edges.py`).
 
-Through a lens or an open shutter a pixel sees surfaces that its centre does not tell of. Samples are then kept for the
-pixel that shows their surface (`moments.py`), and pixels put together by camera rays as on edges (`blur.py`).
+With defocus or motion blur, samples are reprojected through the centre of the lens, at one reference time
+(`reprojection.py`). They are filtered there, without blur, and blurred again by supersampling lens and shutter
+(`blur.py`).
 
-Where that leaves the plain mean by more than the noise explains, the mean is believed: the bias vanishes with the
-noise. On edges a part of the difference is given back, as much of it as is not noise (James and Stein 1961)
+Where the picture differs from the unfiltered mean by more than noise explains, the mean wins: the bias of the filter
+vanishes with the noise. On edges, the difference is shrunk by its noise (James and Stein 1961) and added
 (`compose.py`).
 """
 
@@ -24,6 +25,6 @@ FILTER_MODULES = (
 )
 """Modules with the kernels of the filter."""
 BLUR_MODULES = (blur,)
-"""Modules with the kernels that a lens or an open shutter needs in addition."""
+"""Modules with the kernels that defocus or motion blur needs in addition."""
 
 __all__ = ["BLUR_MODULES", "FILTER_MODULES", "SCRATCH", "Reconstruction", "surfaces_move"]

@@ -1,123 +1,143 @@
-"""The picture of filtered irradiance: what it is away from edges and on them, and where the plain mean is believed."""
+"""The picture from filtered irradiance: with supersampled edges, and corrected towards the unfiltered mean.
 
-from typing import Any
+Away from edges, a pixel whose filtered value differs from the unfiltered mean by more standard errors than noise
+explains takes the mean. On edges, the difference is shrunk by its noise (James and Stein 1961) and added.
+"""
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
-from warp_ir.reconstruction.edges import Irradiance, Pixel, on_edge, supersample_edge
-from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels, value
+from warp_ir.reconstruction.edges import SupersampledPixel, WeightedIrradiance, on_edge, supersample_edge
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels, rgb
 from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
 from warp_ir.reconstruction.sample_buffer import SampleBuffer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_MOST_EDGE_RAYS = 256
-_TRUST = wp.constant(8.0)  # standard errors by which the result may differ from the mean, away from edges
-_WINDOW = wp.constant(2)  # pixels to each side that tell how much of a difference is noise
+_MAX_EDGE_RAYS = 256
+_MAX_STANDARD_ERRORS = wp.constant(8.0)  # by which the filtered value may differ from the mean, away from edges
+_RADIUS = wp.constant(2)  # of the window over which the noise of differences on edges is estimated [pixels]
 
 
 @wp.struct
 class ResolvedPicture:
-    """What becomes of it all, and what it lacks on edges."""
+    """The picture, one column per pixel, and what its correction on edges needs."""
 
-    rows: wp.array2d[wp.vec3]  # radiance by way of lights, of surfaces; if there are five, albedo, normal, plain mean
-    rest: (
-        IrradianceLayer  # plain mean less picture, and how large noise makes its square on average; -1: not on an edge
-    )
-    edge_rays: int
+    rows: wp.array2d[wp.vec3]  # direct with emission, indirect; if there are five: albedo, normal, unfiltered mean
+    edge_residual: IrradianceLayer  # unfiltered mean minus picture, w: its expected square by noise; -1: no edge
+    max_rays: int  # of a supersampled pixel
+
+
+@wp.struct
+class ResolvedPixel:
+    """Radiance of a pixel, its features, and the unfiltered mean of its radiance."""
+
+    emission: wp.vec3
+    direct: wp.vec3
+    indirect: wp.vec3
+    albedo: wp.vec3
+    normal: wp.vec3
+    unfiltered: wp.vec3
 
 
 @wp.func
-def _student(n: float) -> float:
-    """What noise makes of (difference / standard error)² on average, the error being estimated from n samples."""
+def _variance_of_t(n: float) -> float:
+    """Variance (n - 1) / (n - 3) of Student's t: a difference over its standard error, estimated from n samples."""
     return wp.where(n > 3.5, (n - 1.0) / wp.max(n - 3.0, 1.0), 1.0e30)
 
 
 @wp.func
 def shrink_to_mean(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
-    """What is to be believed of a difference between the plain mean and the result, by itself."""
+    """The bias of a pixel: the difference between unfiltered and filtered value, shrunk by its noise."""
     d = mean_channel(difference)
-    ratio = _TRUST * _TRUST * _student(n) * variance / (d * d + 1.0e-30)
+    ratio = _MAX_STANDARD_ERRORS * _MAX_STANDARD_ERRORS * _variance_of_t(n) * variance / (d * d + 1.0e-30)
     return difference / (1.0 + ratio * ratio)
 
 
-@wp.struct
-class ResolvedPixel:
-    """A pixel: radiance by what emits, by way of lights and of surfaces, features, and the plain mean."""
-
-    emitted: wp.vec3
-    direct: wp.vec3
-    indirect: wp.vec3
-    albedo: wp.vec3
-    normal: wp.vec3
-    plain: wp.vec3
-
-
 @wp.func
-def plain_estimate(film: FilmData, p: int) -> ResolvedPixel:
-    """The film's own means."""
+def unfiltered_estimate(film: FilmData, p: int) -> ResolvedPixel:
+    """A pixel of the film's own means."""
     x = ResolvedPixel()
-    x.emitted = emission_of(film, p)
+    x.emission = emission_of(film, p)
     x.direct = film.direct[p]
     x.indirect = film.indirect[p]
     x.albedo = film.albedo[p] / float(film.count[p])
     x.normal = film.normal[p] / float(film.count[p])
-    x.plain = x.emitted + x.direct + x.indirect
+    x.unfiltered = x.emission + x.direct + x.indirect
     return x
 
 
 @wp.func
 def filtered_estimate(
-    sampled: ResolvedPixel, seen: SampleBuffer, layer: IrradianceLayer, p: int, exposure: float, n: float
+    unfiltered: ResolvedPixel, samples: SampleBuffer, layer: IrradianceLayer, p: int, exposure: float, n: float
 ) -> ResolvedPixel:
-    """The filtered light of a pixel that shows one surface, unless the film's mean contradicts it."""
-    x = sampled
-    reflected = mean_channel(x.albedo) * exposure
-    noise = seen.noise[p] * (reflected * reflected / n)
-    x.direct = wp.cw_mul(x.albedo, value(layer.direct[p])) * exposure
-    x.indirect = wp.cw_mul(x.albedo, value(layer.indirect[p])) * exposure
-    x.direct += shrink_to_mean(sampled.direct - x.direct, noise[0], n)
-    x.indirect += shrink_to_mean(sampled.indirect - x.indirect, noise[1], n)
+    """A pixel that shows one surface: its filtered irradiance, corrected by the mean of its `n` iterations."""
+    x = unfiltered
+    reflectance = mean_channel(x.albedo) * exposure
+    variance = samples.variance[p] * (reflectance * reflectance / n)
+    x.direct = wp.cw_mul(x.albedo, rgb(layer.direct[p])) * exposure
+    x.indirect = wp.cw_mul(x.albedo, rgb(layer.indirect[p])) * exposure
+    x.direct += shrink_to_mean(unfiltered.direct - x.direct, variance[0], n)
+    x.indirect += shrink_to_mean(unfiltered.indirect - x.indirect, variance[1], n)
     return x
 
 
 @wp.func
 def supersampled_estimate(
-    sampled: ResolvedPixel, film: FilmData, pixel: Pixel, p: int, exposure: float, out: ResolvedPicture
+    unfiltered: ResolvedPixel, film: FilmData, pixel: SupersampledPixel, p: int, exposure: float, out: ResolvedPicture
 ) -> ResolvedPixel:
-    """What many rays found, times `exposure`; notes how far the plain mean of the film's own is off."""
-    x = sampled
+    """A supersampled pixel times `exposure`; stores the residual of the film's own camera rays."""
+    x = unfiltered
     if pixel.rays > film.count[p]:
         x.albedo = pixel.albedo / float(pixel.rays)
         x.normal = pixel.normal / float(pixel.rays)
-        # The mean as it were of as many rays: less what the film's own saw, and more what all see.
-        x.plain += (pixel.direct - pixel.own_direct + pixel.indirect - pixel.own_indirect) * exposure
-        x.plain += pixel.emission * exposure - x.emitted
-        x.emitted = pixel.emission * exposure
+        # The unfiltered mean as if it had been made of all the rays: the film's rays are replaced by all of them.
+        x.unfiltered += (pixel.direct - pixel.film_direct + pixel.indirect - pixel.film_indirect) * exposure
+        x.unfiltered += pixel.emission * exposure - x.emission
+        x.emission = pixel.emission * exposure
     x.direct = pixel.direct * exposure
     x.indirect = pixel.indirect * exposure
     if film.hits[p] > 0:
         n = float(film.count[p])
-        noise = (pixel.own_noise * (exposure * exposure / n) + wp.vec2(1.0e-30)) * _student(n)
-        more = sampled.direct - pixel.own_direct * exposure
-        out.rest.direct[p] = wp.vec4(more[0], more[1], more[2], noise[0])
-        more = sampled.indirect - pixel.own_indirect * exposure
-        out.rest.indirect[p] = wp.vec4(more[0], more[1], more[2], noise[1])
+        noise = (pixel.variance * (exposure * exposure / n) + wp.vec2(1.0e-30)) * _variance_of_t(n)
+        residual = unfiltered.direct - pixel.film_direct * exposure
+        out.edge_residual.direct[p] = wp.vec4(residual[0], residual[1], residual[2], noise[0])
+        residual = unfiltered.indirect - pixel.film_indirect * exposure
+        out.edge_residual.indirect[p] = wp.vec4(residual[0], residual[1], residual[2], noise[1])
     return x
 
 
 @wp.func
-def show(out: ResolvedPicture, p: int, x: ResolvedPixel) -> None:
-    """Fills a pixel's rows."""
+def store_pixel(out: ResolvedPicture, p: int, x: ResolvedPixel) -> None:
+    """Fills the rows of a pixel."""
     if out.rows.shape[0] > 2:
         out.rows[2, p] = x.albedo
         out.rows[3, p] = x.normal
-        out.rows[4, p] = x.plain
-    out.rows[0, p] = x.direct + x.emitted
+        out.rows[4, p] = x.unfiltered
+    out.rows[0, p] = x.direct + x.emission
     out.rows[1, p] = x.indirect
+
+
+@wp.func
+def _unassigned_irradiance(
+    samples: SampleBuffer, p: int, unfiltered: ResolvedPixel, exposure: float
+) -> WeightedIrradiance:
+    """Irradiance of surfaces that no pixel centre shows: of the pixel's unassigned samples or, without, of all."""
+    out = WeightedIrradiance()
+    out.weight = float(samples.unassigned_count[p])
+    out.direct = samples.unassigned_direct[p]
+    out.indirect = samples.unassigned_indirect[p]
+    if samples.unassigned_count[p] == 0:
+        out.weight = exposure
+        out.direct = wp.cw_div(unfiltered.direct, wp.max(unfiltered.albedo, wp.vec3(1.0e-6)))
+        out.indirect = wp.cw_div(unfiltered.indirect, wp.max(unfiltered.albedo, wp.vec3(1.0e-6)))
+    means = mean_channels(out.direct, out.indirect)
+    out.variance = wp.cw_mul(means, means) / out.weight
+    return out
 
 
 @wp.kernel(module="warp_ir.gbuffer", cuda_max_registers=MAX_REGISTERS)  # so that camera rays are compiled once
@@ -125,87 +145,92 @@ def _compose(
     first: int,
     scene: SceneData,
     camera: CameraData,
-    seen: SampleBuffer,
+    samples: SampleBuffer,
     layer: IrradianceLayer,
     film: FilmData,
     exposure: float,
     out: ResolvedPicture,
 ) -> None:
-    """Radiance of a pixel from irradiance on surfaces; on edges, how far the plain mean of the same rays is off."""
+    """Radiance of a pixel from filtered irradiance; on edges, from supersampling."""
     p = first + wp.tid()
-    surfaces = seen.surfaces
-    sampled = plain_estimate(film, p)
-    shown = sampled
-    out.rest.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    if seen.count[p] != film.count[p] or on_edge(surfaces, film, p):
-        # What neither the pixel nor a neighbour shows is lit like such samples, if there were any, or like all.
-        other = Irradiance()
-        other.weight = float(seen.other_count[p])
-        other.direct = seen.other_direct[p]
-        other.indirect = seen.other_indirect[p]
-        if seen.other_count[p] == 0:
-            other.weight = exposure
-            other.direct = wp.cw_div(sampled.direct, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
-            other.indirect = wp.cw_div(sampled.indirect, wp.max(sampled.albedo, wp.vec3(1.0e-6)))
-        means = mean_channels(other.direct, other.indirect)
-        other.noise = wp.cw_mul(means, means) / other.weight
-        pixel = supersample_edge(scene, camera, seen, layer, p, other, wp.vec2i(film.count[p], out.edge_rays))
-        shown = supersampled_estimate(sampled, film, pixel, p, exposure, out)
+    surfaces = samples.surfaces
+    unfiltered = unfiltered_estimate(film, p)
+    x = unfiltered
+    out.edge_residual.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+    if samples.count[p] != film.count[p] or on_edge(surfaces, film, p):
+        unassigned = _unassigned_irradiance(samples, p, unfiltered, exposure)
+        ray_counts = wp.vec2i(film.count[p], out.max_rays)
+        pixel = supersample_edge(scene, camera, samples, layer, p, unassigned, ray_counts)
+        x = supersampled_estimate(unfiltered, film, pixel, p, exposure, out)
     elif surfaces.footprint[p] > 0.0 and layer.direct[p][3] >= 0.0:
-        shown = filtered_estimate(sampled, seen, layer, p, exposure, float(film.count[p]))
-    show(out, p, shown)
+        x = filtered_estimate(unfiltered, samples, layer, p, exposure, float(film.count[p]))
+    store_pixel(out, p, x)
 
 
 @wp.kernel
 def _correct_edges(first: int, surfaces: PixelSurfaces, out: ResolvedPicture) -> None:
-    """Gives back to pixels on edges what is not noise in their difference to the plain mean.
+    """Adds to pixels on edges the part of the residual that is not noise (James and Stein 1961).
 
-    That of a few pixels together is known best: if noise alone made the differences, their squares would be as large
-    as expected on average; of squares that are r times as large, the share 1 - 1/r is real.
+    The residuals of neighbouring pixels are pooled: if their mean square is r times what noise explains, the fraction
+    1 - 1/r of the residual is bias.
     """
     p = first + wp.tid()
-    if out.rest.direct[p][3] >= 0.0:
+    if out.edge_residual.direct[p][3] >= 0.0:
         ratio = wp.vec2(0.0)
         weights = float(0.0)
-        for dy in range(-_WINDOW, _WINDOW + 1):
-            for dx in range(-_WINDOW, _WINDOW + 1):
+        for dy in range(-_RADIUS, _RADIUS + 1):
+            for dx in range(-_RADIUS, _RADIUS + 1):
                 x = p % surfaces.columns + dx
                 y = p // surfaces.columns + dy
                 if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                    d = out.rest.direct[y * surfaces.columns + x]
+                    d = out.edge_residual.direct[y * surfaces.columns + x]
                     if d[3] >= 0.0:
-                        i = out.rest.indirect[y * surfaces.columns + x]
-                        means = mean_channels(value(d), value(i))
+                        i = out.edge_residual.indirect[y * surfaces.columns + x]
+                        means = mean_channels(rgb(d), rgb(i))
                         w = 1.0 / (1.0 + 0.5 * float(dx * dx + dy * dy))
                         ratio += w * wp.cw_div(wp.cw_mul(means, means), wp.vec2(d[3], i[3]) + wp.vec2(1.0e-30))
                         weights += w
-        d = out.rest.direct[p]
-        i = out.rest.indirect[p]
-        out.rows[0, p] = out.rows[0, p] + value(d) * wp.max(1.0 - weights / (ratio[0] + 1.0e-30), 0.0)
-        out.rows[1, p] = out.rows[1, p] + value(i) * wp.max(1.0 - weights / (ratio[1] + 1.0e-30), 0.0)
+        d = out.edge_residual.direct[p]
+        i = out.edge_residual.indirect[p]
+        out.rows[0, p] = out.rows[0, p] + rgb(d) * wp.max(1.0 - weights / (ratio[0] + 1.0e-30), 0.0)
+        out.rows[1, p] = out.rows[1, p] + rgb(i) * wp.max(1.0 - weights / (ratio[1] + 1.0e-30), 0.0)
 
 
 def edge_rays(iterations: int) -> int:
-    """Camera rays for a pixel on an edge: what edges lack then is little beside noise."""
-    return min(16 + 2 * iterations, _MOST_EDGE_RAYS)
+    """Maximum number of camera rays through a pixel on an edge: the error of the edge is then below the noise."""
+    return min(16 + 2 * iterations, _MAX_EDGE_RAYS)
 
 
-def new_resolved_picture(pixels: int, rest: Any, rays: int, features: bool, launcher: Launcher) -> Any:
-    """An uninitialised `ResolvedPicture`; `rest` is overwritten, `rays` are those of a pixel on an edge."""
+def new_resolved_picture(
+    pixels: int, edge_residual: IrradianceLayer, max_rays: int, features: bool, launcher: Launcher
+) -> ResolvedPicture:
+    """An uninitialised `ResolvedPicture`, with or without features; `edge_residual` is overwritten."""
     out = ResolvedPicture()
-    out.rest = rest
+    out.edge_residual = edge_residual
     out.rows = launcher.empty((5 if features else 2, pixels), wp.vec3)
-    out.edge_rays = rays
+    out.max_rays = max_rays
     return out
 
 
 def compose(
-    scene: DeviceScene, camera: Any, seen: Any, layer: Any, film: Any, exposure: float, out: Any, launcher: Launcher
+    scene: DeviceScene,
+    camera: CameraData,
+    samples: SampleBuffer,
+    layer: IrradianceLayer,
+    film: FilmData,
+    exposure: float,
+    out: ResolvedPicture,
+    launcher: Launcher,
 ) -> None:
     """Fills a `ResolvedPicture` from a filtered `IrradianceLayer`."""
-    launcher.launch(_compose, camera.columns * camera.rows, [scene.data, camera, seen, layer, film, exposure, out])
+    launcher.launch(_compose, camera.columns * camera.rows, [scene.data, camera, samples, layer, film, exposure, out])
 
 
-def correct_edges(surfaces: Any, out: Any, launcher: Launcher) -> None:
-    """Gives back to a `ResolvedPicture` what it lacks on edges."""
+def correct_edges(surfaces: PixelSurfaces, out: ResolvedPicture, launcher: Launcher) -> None:
+    """Adds the bias of the pixels on edges to a `ResolvedPicture`."""
     launcher.launch(_correct_edges, surfaces.columns * surfaces.rows, [surfaces, out])
+
+
+def rows_to_host(out: ResolvedPicture) -> npt.NDArray[np.float32]:
+    """The rows of a `ResolvedPicture` on the host, float32 [2 or 5, pixels, 3]."""
+    return np.asarray(out.rows.numpy())

@@ -1,12 +1,12 @@
-"""The time in which the shutter is open: where surfaces are at each moment, and which pixel a sample is for.
+"""Reprojection of defocused and moving samples: into the pixel that shows the same surface point at a reference time.
 
-A pixel stands for what its centre shows at the moment in the middle, through the middle of the lens. A sample falls
-anywhere, at any moment; it is for the pixel in which the same point of the same triangle is seen then and there. So
-none is lost, and none is blurred.
+A pixel stands for the surface that is visible through its centre and the centre of the lens at the reference time, the
+middle shutter sample. A sample is made through any point of the lens at any shutter sample; it is accumulated in the
+pixel that shows the same point of the same triangle at the reference time. So no sample is lost, and none is blurred.
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -15,8 +15,8 @@ from warp_ir.device.launcher import Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, SurfacePoint, project
-from warp_ir.reconstruction.pixel_surfaces import MATCH, pixel_around, same_surface
-from warp_ir.reconstruction.sample_buffer import SampleBuffer, add_other, add_sample
+from warp_ir.reconstruction.pixel_surfaces import MIN_MATCH, match_weight, neighbor_pixel
+from warp_ir.reconstruction.sample_buffer import SampleBuffer, add_sample, add_unassigned
 from warp_ir.surface import Hit, scene_at, shading_normal
 from warp_ir.tiles import indices, pixel_at
 
@@ -24,44 +24,49 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 class ShutterSample(Protocol):
-    """The scene and the camera at one moment, and what the camera multiplies light by."""
+    """The scene, the camera and its exposure at one time while the shutter is open."""
 
     @property
-    def scene(self) -> DeviceScene: ...  # noqa: D102
+    def scene(self) -> DeviceScene:
+        """The scene at that time."""
 
     @property
-    def camera(self) -> Any: ...  # noqa: D102
+    def camera(self) -> CameraData:
+        """The camera at that time."""
 
     @property
-    def exposure(self) -> float: ...  # noqa: D102
+    def exposure(self) -> float:
+        """Factor from radiance to the film."""
 
 
 @wp.struct
-class Blur:
-    """The time in which the shutter is open, as moments in their order; one row if it is not."""
+class ShutterData:
+    """The shutter samples in their order; one if only the lens blurs."""
 
     scenes: wp.array[SceneData]
     cameras: wp.array[CameraData]
     exposures: wp.array[wp.float32]
-    shifts: wp.array[wp.int32]  # rows from a triangle that moves in the middle moment to the same one in another
-    bits: int  # there are 2^bits
-    middle: int
+    row_offsets: wp.array[wp.int32]  # row of a moving triangle at a shutter sample minus its row at the reference time
+    log2_count: int
+    reference: int  # number of the middle shutter sample
     first_moving: int  # row of the first triangle that moves
     sobol: wp.array[wp.uint32]
-    moves: int  # 1: surfaces do, and are the same triangles at every moment
+    surfaces_move: int  # 1: surfaces move, and are made of the same triangles at all shutter samples
 
 
 @wp.struct
-class Point:
-    """A point of a surface."""
+class ReprojectedPoint:
+    """A surface point at the reference time."""
 
     position: wp.vec3
-    normal: wp.vec3  # without normal maps
+    normal: wp.vec3  # smooth shading normal, without normal maps
 
 
 @wp.func(inline=False)
-def _placed(address: wp.uint64, surface_point: SurfacePoint, triangle: int, facing: wp.vec3) -> Point:
-    """Where a point of a triangle is; its normal is on the side of `facing`."""
+def _evaluate_surface_point(
+    address: wp.uint64, surface_point: SurfacePoint, triangle: int, facing: wp.vec3
+) -> ReprojectedPoint:
+    """Position and normal of a surface point in the scene at `address`; the normal is on the side of `facing`."""
     scene = scene_at(address)[0]
     hit = Hit()
     hit.triangle = triangle
@@ -72,7 +77,7 @@ def _placed(address: wp.uint64, surface_point: SurfacePoint, triangle: int, faci
     b = scene.points[scene.indices[3 * triangle + 1]]
     c = scene.points[scene.indices[3 * triangle + 2]]
     n = wp.cross(b - a, c - a)
-    out = Point()
+    out = ReprojectedPoint()
     out.position = a * hit.u + b * hit.v + c * (1.0 - hit.u - hit.v)
     if hit.instance >= 0:
         n = wp.transpose(scene.instances[hit.instance].inverse) * n
@@ -83,86 +88,97 @@ def _placed(address: wp.uint64, surface_point: SurfacePoint, triangle: int, faci
 
 
 @wp.func
-def at_reference_time(
-    blur: Blur, moment: int, surface_point: SurfacePoint, position: wp.vec3, normal: wp.vec3
-) -> Point:
-    """Where a point of a moment is at the moment in the middle. Normals turn little while a shutter is open."""
-    out = Point()
+def reproject_to_reference(
+    shutter: ShutterData, shutter_sample: int, surface_point: SurfacePoint, position: wp.vec3, normal: wp.vec3
+) -> ReprojectedPoint:
+    """Position and normal at the reference time of a surface point that a ray has hit at a shutter sample.
+
+    The normal is approximate: the change of the normal is added to it.
+    """
+    out = ReprojectedPoint()
     out.position = position
     out.normal = normal
-    moving = surface_point.triangle >= blur.first_moving
-    if blur.moves == 1 and moment != blur.middle and (moving or surface_point.instance >= 0):
+    moving = surface_point.triangle >= shutter.first_moving
+    away = shutter_sample != shutter.reference
+    if shutter.surfaces_move == 1 and away and (moving or surface_point.instance >= 0):
         row = surface_point.triangle
         if moving:
-            row -= blur.shifts[moment]
-        there = _placed(blur.scenes[moment].address, surface_point, surface_point.triangle, normal)
-        here = _placed(blur.scenes[blur.middle].address, surface_point, row, normal)
-        # What the point is off its triangle, as on smooth surfaces, it stays.
-        out.position += here.position - there.position
-        out.normal += here.normal - there.normal
+            row -= shutter.row_offsets[shutter_sample]
+        scene = shutter.scenes[shutter_sample].address
+        reference_scene = shutter.scenes[shutter.reference].address
+        hit = _evaluate_surface_point(scene, surface_point, surface_point.triangle, normal)
+        reference = _evaluate_surface_point(reference_scene, surface_point, row, normal)
+        # Only the motion is added, which keeps the smooth-terminator offset.
+        out.position += reference.position - hit.position
+        out.normal += reference.normal - hit.normal
     return out
 
 
-@wp.kernel(module="warp_ir.reconstruction.blur")  # so that what they share is compiled once
-def _aim(
+@wp.kernel(module="warp_ir.reconstruction.blur")  # so that shared functions are compiled once
+def _assign_pixels(
     first: int,
-    blur: Blur,
-    moment: int,
+    shutter: ShutterData,
+    shutter_sample: int,
     gbuffer: GBuffer,
-    seen: SampleBuffer,
+    samples: SampleBuffer,
     pixels: wp.array2d[wp.int32],
 ) -> None:
-    """Says for which pixel each sample is (first row); those that no pixel's centre shows stay where they are."""
+    """Writes the pixel that each sample is accumulated in (row 0) and the one that traced it (row 1).
+
+    Samples on surfaces that no pixel centre shows are added to the unassigned ones.
+    """
     i = first + wp.tid()
     p = pixel_at(gbuffer.tiles, i)
-    surfaces = seen.surfaces
-    none = surfaces.columns * surfaces.rows
-    pixels[0, i] = none
+    surfaces = samples.surfaces
+    unassigned = surfaces.columns * surfaces.rows
+    pixels[0, i] = unassigned
     pixels[1, i] = p
     if p >= 0 and gbuffer.mesh[p] >= 0 and wp.max(gbuffer.albedo[p]) > 0.0:
         surface_point = SurfacePoint()
-        if blur.moves == 1:
+        if shutter.surfaces_move == 1:
             surface_point = gbuffer.surface_point[p]
-        point = at_reference_time(blur, moment, surface_point, gbuffer.position[p], gbuffer.smooth_normal[p])
-        place = project(blur.cameras[blur.middle], point.position)
+        point = reproject_to_reference(
+            shutter, shutter_sample, surface_point, gbuffer.position[p], gbuffer.smooth_normal[p]
+        )
+        place = project(shutter.cameras[shutter.reference], point.position)
         x = int(wp.floor(place[0]))
         y = int(wp.floor(place[1]))
         if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
             q = y * surfaces.columns + x
-            if same_surface(surfaces, q, point.position, point.normal) > MATCH:
+            if match_weight(surfaces, q, point.position, point.normal) > MIN_MATCH:
                 pixels[0, i] = q
             else:
                 for k in range(9):
-                    near = pixel_around(surfaces, q, k)
-                    if same_surface(surfaces, near, point.position, point.normal) > MATCH:
-                        pixels[0, i] = near
-        if pixels[0, i] == none:
-            add_other(seen, p, gbuffer.normal_or_direct[p], gbuffer.indirect[p])
+                    neighbor = neighbor_pixel(surfaces, q, k)
+                    if match_weight(surfaces, neighbor, point.position, point.normal) > MIN_MATCH:
+                        pixels[0, i] = neighbor
+        if pixels[0, i] == unassigned:
+            add_unassigned(samples, p, gbuffer.normal_or_direct[p], gbuffer.indirect[p])
 
 
 @wp.kernel(module="warp_ir.reconstruction.blur")
-def _take(
+def _add_reprojected(
     first: int,
-    samples: int,
+    count: int,
     pixels: wp.array2d[wp.int32],
     gbuffer: GBuffer,
-    seen: SampleBuffer,
+    samples: SampleBuffer,
 ) -> None:
-    """Adds to each pixel the samples that are for it: a run of the sorted ones."""
+    """Adds to a pixel the samples that are assigned to it: a run of the `count` sorted ones."""
     p = first + wp.tid()
-    k = int(wp.lower_bound(pixels[0], 0, samples, p))
-    while k < samples and pixels[0, k] == p:
+    k = int(wp.lower_bound(pixels[0], 0, count, p))
+    while k < count and pixels[0, k] == p:
         q = pixels[1, k]
-        add_sample(seen, p, gbuffer.normal_or_direct[q], gbuffer.indirect[q])
+        add_sample(samples, p, gbuffer.normal_or_direct[q], gbuffer.indirect[q])
         k += 1
 
 
 @wp.kernel(module="warp_ir.reconstruction.blur")
-def _estimate_missing_noise(first: int, seen: SampleBuffer) -> None:
-    """Of pixels without samples: the noise of their neighbours' on the same surface."""
+def _estimate_missing_variance(first: int, samples: SampleBuffer) -> None:
+    """Sets the variance of a pixel without samples to that of its neighbours on the same surface."""
     p = first + wp.tid()
-    surfaces = seen.surfaces
-    if seen.count[p] == 0:
+    surfaces = samples.surfaces
+    if samples.count[p] == 0:
         sum = wp.vec2(0.0)
         weights = float(0.0)
         for dy in range(-2, 3):
@@ -171,66 +187,72 @@ def _estimate_missing_noise(first: int, seen: SampleBuffer) -> None:
                 y = p // surfaces.columns + 2 * dy
                 if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                     q = y * surfaces.columns + x
-                    if seen.count[q] > 0:
-                        w = same_surface(surfaces, p, surfaces.position[q], surfaces.normal[q])
-                        sum += w * seen.noise[q]
+                    if samples.count[q] > 0:
+                        w = match_weight(surfaces, p, surfaces.position[q], surfaces.normal[q])
+                        sum += w * samples.variance[q]
                         weights += w
-        seen.noise[p] = sum / wp.max(weights, 1.0e-6)
+        samples.variance[p] = sum / wp.max(weights, 1.0e-6)
 
 
 def surfaces_move(scenes: Sequence[DeviceScene]) -> bool:
-    """Whether surfaces are elsewhere at some moments."""
+    """Whether any surface moves between the shutter samples."""
     first = scenes[0]
     places = [[id(group.matrices) for group in s.stored.instances] for s in scenes]
     return any(s.first_triangles != first.first_triangles for s in scenes) or any(p != places[0] for p in places)
 
 
-def new_blur(moments: Sequence[ShutterSample], launcher: Launcher) -> Any:
-    """The `Blur` of the moments of a scene; their number is a power of two."""
-    blur = Blur()
-    blur.bits, blur.middle = len(moments).bit_length() - 1, len(moments) // 2
-    scenes = [m.scene for m in moments]
-    blur.scenes = launcher.array([scene.data for scene in scenes], SceneData)
-    blur.cameras = launcher.array([m.camera for m in moments], CameraData)
-    blur.exposures = launcher.array([m.exposure for m in moments], wp.float32)
-    middle = scenes[blur.middle]
-    shifts = [_shift(scene, middle) for scene in scenes]
-    blur.sobol = middle.data.sobol
-    blur.moves = int(surfaces_move(scenes) and None not in shifts)
+def new_shutter_data(shutter: Sequence[ShutterSample], launcher: Launcher) -> ShutterData:
+    """The `ShutterData` of some shutter samples, whose number is a power of two."""
+    data = ShutterData()
+    data.log2_count, data.reference = len(shutter).bit_length() - 1, len(shutter) // 2
+    scenes = [sample.scene for sample in shutter]
+    data.scenes = launcher.array([scene.data for scene in scenes], SceneData)
+    data.cameras = launcher.array([sample.camera for sample in shutter], CameraData)
+    data.exposures = launcher.array([sample.exposure for sample in shutter], wp.float32)
+    reference = scenes[data.reference]
+    offsets = [_row_offset(scene, reference) for scene in scenes]
+    data.sobol = reference.data.sobol
+    data.surfaces_move = int(surfaces_move(scenes) and None not in offsets)
     moving = [
         row
         for s in scenes
-        for a, b in zip(s.first_triangles, middle.first_triangles, strict=False)
+        for a, b in zip(s.first_triangles, reference.first_triangles, strict=False)
         if a != b
         for row in (a, b)
     ]
-    blur.first_moving = min(moving, default=2**31 - 1)
-    blur.shifts = launcher.array([shift or 0 for shift in shifts], wp.int32)
-    return blur
+    data.first_moving = min(moving, default=2**31 - 1)
+    data.row_offsets = launcher.array([offset or 0 for offset in offsets], wp.int32)
+    return data
 
 
-def _shift(one: DeviceScene, other: DeviceScene) -> int | None:
-    """Rows from the triangles that move in one moment to the same in another; None: they are not the same."""
-    a, b = one.stored, other.stored
-    counts = [[len(group.matrices) for group in scene.instances] for scene in (a, b)]
+def _row_offset(scene: DeviceScene, reference: DeviceScene) -> int | None:
+    """Rows of the moving triangles minus their rows in the reference scene; None if the triangles are not the same."""
+    a, b = scene.stored, reference.stored
+    counts = [[len(group.matrices) for group in stored.instances] for stored in (a, b)]
     if len(a.meshes) != len(b.meshes) or counts[0] != counts[1]:
         return None
-    for mine, its in zip(a.meshes, b.meshes, strict=True):
-        if mine.triangles is not its.triangles and not np.array_equal(mine.triangles, its.triangles):
+    for mine, theirs in zip(a.meshes, b.meshes, strict=True):
+        if mine.triangles is not theirs.triangles and not np.array_equal(mine.triangles, theirs.triangles):
             return None
-    shifts = {mine - its for mine, its in zip(one.first_triangles, other.first_triangles, strict=True) if mine != its}
-    return None if len(shifts) > 1 else next(iter(shifts), 0)
+    offsets = {
+        mine - theirs
+        for mine, theirs in zip(scene.first_triangles, reference.first_triangles, strict=True)
+        if mine != theirs
+    }
+    return None if len(offsets) > 1 else next(iter(offsets), 0)
 
 
-def accumulate_blurred(blur: Any, seen: Any, shutter_sample: int, gbuffer: GBuffer, scratch: Scratch) -> None:
-    """Adds one iteration's samples of irradiance over π, made at a moment, to `SampleBuffer`."""
+def accumulate_reprojected(
+    shutter: ShutterData, samples: SampleBuffer, shutter_sample: int, gbuffer: GBuffer, scratch: Scratch
+) -> None:
+    """Adds one iteration's samples of irradiance over π, made at a shutter sample, to a `SampleBuffer`."""
     launcher, count = scratch.launcher, indices(gbuffer.tiles)
-    order = scratch.array("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
-    launcher.launch(_aim, count, [blur, shutter_sample, gbuffer, seen, order])
-    wp.utils.radix_sort_pairs(order[0], order[1], count)
-    launcher.launch(_take, seen.count.shape[0], [count, order, gbuffer, seen])
+    pixels = scratch.array("sample_pixels", 4 * count, wp.int32)[: 4 * count].reshape((2, 2 * count))
+    launcher.launch(_assign_pixels, count, [shutter, shutter_sample, gbuffer, samples, pixels])
+    wp.utils.radix_sort_pairs(pixels[0], pixels[1], count)
+    launcher.launch(_add_reprojected, samples.count.shape[0], [count, pixels, gbuffer, samples])
 
 
-def estimate_missing_noise(seen: Any, launcher: Launcher) -> None:
-    """Completes the noise of `SampleBuffer` where they have no samples."""
-    launcher.launch(_estimate_missing_noise, seen.count.shape[0], [seen])
+def estimate_missing_variance(samples: SampleBuffer, launcher: Launcher) -> None:
+    """Fills in the variance of those pixels of a `SampleBuffer` that have no samples."""
+    launcher.launch(_estimate_missing_variance, samples.count.shape[0], [samples])
