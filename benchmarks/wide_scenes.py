@@ -6,7 +6,6 @@ The program prints the variance of one iteration and its CPU time, with and with
 import argparse
 import time
 from collections.abc import Sequence
-from unittest.mock import patch
 
 import numpy as np
 from methods import load_task, stored_tasks
@@ -16,7 +15,7 @@ import warp_ir.estimators.vpl
 from warp_ir.procedural import cube, mesh, quad
 from warp_ir.renderer import Renderer
 from warp_ir.scene import Camera, Floats, Light, LightKind, Material, Mesh, Scene
-from warp_ir.vpl.guide import unguided
+from warp_ir.settings import GuidingSettings
 
 _WHITE, _RED, _LAMP, _GROUND = range(4)
 _MATERIALS = (
@@ -143,19 +142,15 @@ def _world_from_light(back: Floats) -> Floats:
 def measure(scene: Scene, width: int, iterations: int, *, guided: bool) -> tuple[float, float, float]:
     """Relative variance of an iteration per pixel and of its mean, and CPU time [s] per iteration with guiding."""
     settings = ir.RenderSettings(width=width, height=width, filter=False)
-    learn = warp_ir.estimators.vpl.learn
-    if not guided:
-        learn = lambda scene, camera, launcher, settings: unguided(scene, launcher)  # noqa: E731
-    with patch.object(warp_ir.estimators.vpl, "learn", learn):
-        renderer = Renderer(scene, settings, threads=1)
-        film, means = renderer.new_film(), []
-        begin = time.process_time()
-        for k in range(iterations):
-            one = renderer.new_film()
-            renderer.add_iteration(one, k)
-            film.merge(one)
-            means.append(one.radiance().mean(dtype=np.float64))
-        seconds = time.process_time() - begin
+    renderer = Renderer(scene, settings, threads=1, guiding=GuidingSettings() if guided else None)
+    film, means = renderer.new_film(), []
+    begin = time.process_time()
+    for k in range(iterations):
+        one = renderer.new_film()
+        renderer.add_iteration(one, k)
+        film.merge(one)
+        means.append(one.radiance().mean(dtype=np.float64))
+    seconds = time.process_time() - begin
     return film.error() ** 2 * iterations, float(np.var(means, ddof=1) / np.mean(means) ** 2), seconds / iterations
 
 

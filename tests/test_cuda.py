@@ -20,6 +20,7 @@ from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import SceneData
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
+from warp_ir.settings import GuidingSettings
 
 pytestmark = pytest.mark.extended
 
@@ -72,7 +73,7 @@ def test_kernels_compile_for_cuda(module, arch, tmp_path):
     (cubin,) = tmp_path.glob("*.cubin")
     used = resources(cubin)
     assert len(used) == KERNELS[module]
-    traces_rays = "_meet_" in next(tmp_path.glob("*.cu")).read_text()
+    traces_rays = "intersect_scene_" in next(tmp_path.glob("*.cu")).read_text()
     for name, (registers, local) in used.items():
         if traces_rays and local > _MOST_LOCAL:
             assert registers <= MAX_REGISTERS, f"{name}: {registers} registers"
@@ -170,16 +171,16 @@ def test_iterations_read_nothing_back(scene, settings, capacity, monkeypatch):
 
 @pytest.mark.parametrize("name", ["rooms", "house"])
 def test_guided_iterations_read_nothing_back(name, monkeypatch):
-    """The same after the pilot, which is sent once, and may look at what it has found."""
+    """Guided iterations read nothing back either; learning the guide, which happens one time, may read."""
     monkeypatch.syspath_prepend(str(PACKAGE.parent / "benchmarks"))
     import wide_scenes
 
-    monkeypatch.setattr(warp_ir.estimators.vpl, "_UNGUIDED", 1)
+    guiding = GuidingSettings(first_iteration=1)
     settings = ir.RenderSettings(width=24, height=24, light_paths=64, iterations=4)
     scene = getattr(wide_scenes, name)()
-    expected = ir.render(scene, settings)
+    expected = Renderer(scene, settings, guiding=guiding).render()
     assert expected.counts["guided_vpls"] == 1
-    renderer = Renderer(scene, settings)
+    renderer = Renderer(scene, settings, guiding=guiding)
     renderer.launcher.synchronous = False
     film = renderer.new_film()
     for iteration in range(2):
@@ -226,7 +227,7 @@ def blind(monkeypatch):
 def test_only_the_launcher_knows_the_device():
     """Whether a kernel's work can be looked at is asked in few places: so the CPU can stand for CUDA in these tests."""
     asking = {path.name for path in PACKAGE.rglob("*.py") if "is_cuda" in path.read_text()}
-    assert asking == {"launch.py", "profiling.py", "gather.py", "build.py", "forest.py"}
+    assert asking == {"launcher.py", "profiling.py", "sets.py", "build.py", "forest.py"}
 
 
 @pytest.mark.gpu
