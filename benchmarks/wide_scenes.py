@@ -11,7 +11,6 @@ import numpy as np
 from methods import load_task, stored_tasks
 
 import warp_ir as ir
-import warp_ir.estimators.vpl
 from warp_ir.procedural import cube, mesh, quad
 from warp_ir.renderer import Renderer
 from warp_ir.scene import Camera, Floats, Light, LightKind, Material, Mesh, Scene

@@ -1,16 +1,21 @@
 """warp_ir: instant radiosity for USD scenes in NVIDIA Warp.
 
-Reading order: `renderer` (the algorithm on one page), `estimators.keller` (the method as published),
-`vpl` (light paths), `gbuffer` and `gather` (what the camera sees, and how it is lit), `film` (how
-iterations add up), `usd` (how a stage becomes a `Scene`).
+Reading order: `renderer` (the algorithm on one page), `estimators.keller` (instant radiosity as published),
+`vpl.emission` (light paths and their VPLs), `gbuffer` and `vpl.gather` (what the camera sees, and how it is lit),
+`film` (how iterations add up), `reconstruction` (the filter), `usd.load` (how a stage becomes a `Scene`).
 
-Every name below is imported on first use, so that ``import warp_ir`` costs nothing.
+Every name below is imported when it is first used, so that ``import warp_ir`` takes no time.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warp_ir.film import Film as Film
+    from warp_ir.image import read_image as read_image
+    from warp_ir.image import write_image as write_image
+    from warp_ir.renderer import Renderer as Renderer
+    from warp_ir.renderer import render as render
     from warp_ir.scene import Camera as Camera
     from warp_ir.scene import InputError as InputError
     from warp_ir.scene import Instances as Instances
@@ -27,6 +32,7 @@ if TYPE_CHECKING:
     from warp_ir.settings import RenderSettings as RenderSettings
     from warp_ir.usd import StageReader as StageReader
     from warp_ir.usd import load_usd as load_usd
+    from warp_ir.vpl.trace import trace_vpls as trace_vpls
 
 __version__ = "0.1.0"
 
@@ -57,12 +63,14 @@ _HOME = {
 __all__ = sorted(_HOME)
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'warp_ir' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"warp_ir.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # a type checker must not take every name for one that exists
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOME:
+            raise AttributeError(f"module 'warp_ir' has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"warp_ir.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

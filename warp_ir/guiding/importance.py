@@ -105,5 +105,5 @@ def _density(connections: VplConnections, contribution: Floats, probability: Flo
         others = np.bincount(parent, probability)[parent] - probability
         neighbours = float((contribution * others).sum() / contribution.sum())
         if neighbours >= _MIN_VPLS_IN_CELL:
-            return neighbours / (connections.extent / 2**level) ** 2
+            return float(neighbours / (connections.extent / 2**level) ** 2)
     return 0.0
