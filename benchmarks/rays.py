@@ -208,7 +208,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     vpls = emit_vpls(
         unguided(uploaded, launcher),
         launcher,
-        paths=PATHS,
+        light_paths=PATHS,
         absorption="roulette",
         max_bounces=settings.max_bounces,
         scramble=1,

@@ -14,7 +14,7 @@ _VEC2, _VEC3, _VEC4 = 8, 12, 16
 # Bytes of a pixel. `FilmData`: mean radiance, its standard deviation, and sums of the G-buffer.
 _FILM = {
     "direct, indirect": 2 * _VEC3,
-    "deviation": _VEC3,
+    "standard_deviation": _VEC3,
     "albedo, normal, position": 3 * _VEC3,
     "depth": _FLOAT,
     "count, hits, rejected, mesh": 4 * _INT,
@@ -30,13 +30,13 @@ _ITERATION = {
 _SAMPLE_BUFFER = {
     "surface: position, normal": 2 * _VEC3,
     "surface: footprint": _FLOAT,
-    "surface: bordering": 1,
-    "direct, indirect, other_direct, other_indirect": 4 * _VEC3,
+    "surface: edge": 1,
+    "direct, indirect, unassigned_direct, unassigned_indirect": 4 * _VEC3,
     "squares": _VEC2,
-    "count, other_count": 2 * _INT,
+    "count, unassigned_count": 2 * _INT,
 }  # 93
 # Scratch of the filter, in the memory of the iteration: two layers of direct and indirect light with their variance.
-_FILTER_SCRATCH = {"layers": 4 * _VEC4, "noise": _VEC2}  # 72
+_FILTER_SCRATCH = {"layers": 4 * _VEC4, "variance": _VEC2}  # 72
 _RESOLVED_PICTURE = {"direct, indirect": 2 * _VEC3}  # 24
 _REPROJECTION = {"samples sorted by pixels": 4 * _INT * 9 // 8}  # 18: scratch buffers have an eighth in reserve
 _SURFACE_POINT = {"triangle, instance, weights": 3 * _INT}  # 12

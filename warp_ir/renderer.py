@@ -179,7 +179,7 @@ class Renderer:
         """Uploads every shutter sample of the scene, and allocates the buffers that an iteration fills in."""
         settings, launcher = self._resolved, self.launcher
         if len(scene.shutter) & (len(scene.shutter) - 1):
-            raise InputError(f"scene: shutter has {len(scene.shutter)} moments, which is no power of two")
+            raise InputError(f"scene: shutter has {len(scene.shutter)} samples, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
         uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
         self._shutter = []

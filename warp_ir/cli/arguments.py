@@ -20,7 +20,7 @@ from warp_ir.settings import RenderSettings
 _FIELDS = {field.name: field for field in dataclasses.fields(RenderSettings)}
 _PICTURE_ONLY = {
     *("iterations", "time_limit", "target_error", "visible_lights", "bound_radius"),
-    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space"),
+    *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space", "filter", "denoise"),
 }
 """Settings that affect the picture but not the light paths: `warp-ir vpls` has no flags for them."""
 _SHORT = {"width": ("-w",)}

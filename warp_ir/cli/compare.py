@@ -143,8 +143,8 @@ class _Stopped(BaseException):
     """A signal ended a render and with it the comparison; the measurements so far are reported."""
 
     def __init__(self, number: int) -> None:
-        # `Film.interrupted` is the number of the signal; True stands for Ctrl-C.
-        self.code = 128 + (number if number > 1 else signal.SIGINT)
+        # `Film.interrupted` is the number of the signal.
+        self.code = 128 + number
 
 
 class _Job:

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import platform
-import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -177,9 +176,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
 
         renderer.render(film, report)
     timings = {**film.timings, "load": load_seconds}
-    # `Film.interrupted` is the number of the signal; True stands for Ctrl-C.
+    # `Film.interrupted` is the number of the signal.
     stop_signal = int(film.interrupted)
-    code = 128 + (stop_signal if stop_signal > 1 else signal.SIGINT) if stop_signal else 0
+    code = 128 + stop_signal if stop_signal else 0
     written: list[Path] = []
     if film.iterations or not stop_signal:
         begin = time.perf_counter()

@@ -12,7 +12,7 @@ from warp_ir.device.launcher import Launcher
 class Scratch:
     """Named arrays on a device, each made when it is first asked for.
 
-    They hold what was last written to them. Whoever needs such arrays owns a `Scratch`; nothing is shared in secret.
+    They hold what was last written to them. Whoever needs such arrays owns a `Scratch`; owners never share an array.
     """
 
     def __init__(self, launcher: Launcher) -> None:

@@ -111,7 +111,7 @@ class Keller:
             vpls = emit_vpls(
                 self._unguided,
                 self._scratch,
-                paths=settings.light_paths,
+                light_paths=settings.light_paths,
                 absorption=settings.absorption,
                 max_bounces=settings.max_bounces,
                 scramble=iteration_scramble(settings.seed, iteration),

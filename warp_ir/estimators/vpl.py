@@ -90,7 +90,7 @@ def _camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
     return x
 
 
-@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # shares compiled rays and lights
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _gather_pixels(
     first: int,
     scene: SceneData,
@@ -110,7 +110,7 @@ def _gather_pixels(
     x = _camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
-    radius = 1.0 / wp.sqrt(bound.minimum)  # of compensation: beyond it G cannot exceed the bound
+    radius = 1.0 / wp.sqrt(bound.minimum)  # length of compensation rays: farther away G cannot exceed the bound
     depth = int(0)
     rays = settings.rays
     while depth <= settings.max_bounces:
@@ -196,7 +196,7 @@ class VplEstimator:
             vpls = emit_vpls(
                 guide,
                 self._scratch,
-                paths=settings.light_paths,
+                light_paths=settings.light_paths,
                 absorption=settings.absorption,
                 max_bounces=settings.max_bounces,
                 scramble=scramble,

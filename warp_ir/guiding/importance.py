@@ -32,7 +32,7 @@ class VplSurvival:
     """Contribution per intensity, by cell."""
     survival_rate: float
     """Share of the VPLs that survive."""
-    density: float
+    density_ratio: float
     """Density of surviving VPLs where they matter, relative to the mean over all surfaces."""
 
 

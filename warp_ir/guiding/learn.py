@@ -90,9 +90,9 @@ def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: 
                 survival, vpls_per_path = learn_survival(connections, guide, launcher), connections.per_path
     if survival is not None:
         vpls_per_path *= survival.survival_rate
-        guide = replace(guide, importance=survival.importance, density=survival.density)
+        guide = replace(guide, importance=survival.importance, density_ratio=survival.density_ratio)
     if vpls_per_path > 0.0:
-        guide = replace(guide, paths=max(min(round(_VPLS_PER_PATH / vpls_per_path), max_paths), 1))
+        guide = replace(guide, path_multiplier=max(min(round(_VPLS_PER_PATH / vpls_per_path), max_paths), 1))
     decisions = {"guided_emitters": guided_scene, "guided_far_lights": photon_target, "guided_vpls": survival}
     for name, result in decisions.items():
         launcher.profile.counts[name] = int(result is not None)

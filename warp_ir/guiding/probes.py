@@ -239,7 +239,7 @@ def connect_vpls(
     vpls = emit_vpls(
         guide,
         Scratch(launcher),
-        paths=paths,
+        light_paths=paths,
         absorption="roulette",
         max_bounces=settings.max_bounces,
         scramble=sobol.iteration_scramble(settings.seed, _LIGHT_PATHS),
@@ -255,6 +255,6 @@ def connect_vpls(
         cell=cells.numpy()[:n].astype(np.int64),
         intensity=_finite(vpls.intensity.numpy()[selected]).sum(axis=1),
         contribution=_finite(contribution.numpy()[: n * _CONNECTIONS]).reshape(n, _CONNECTIONS).mean(axis=1),
-        per_path=on_surfaces / (paths * guide.paths),
+        per_path=on_surfaces / (paths * guide.path_multiplier),
         extent=extent,
     )

@@ -63,7 +63,7 @@ class VplBuffer:
     normal: wp.array[wp.vec4]
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]  # reflections before the VPL; 0 on lights
-    pdf_area: wp.array[wp.float32]  # [on_lights], of the point per area of the light [1/area]; 0 where it has no area
+    pdf_area: wp.array[wp.float32]  # [on_lights], area pdf of the point on the light; 0 where the light has no area
     modifiers: wp.array[wp.int32]  # [on_lights], row of the light's `LightModifiers`, or -1; one row if none has any
 
 
@@ -73,7 +73,7 @@ class LightPathSettings:
 
     scramble: wp.uint32
     paths: int  # light paths started
-    on_lights: int  # the first of them, whose point on the light is stored as a VPL
+    on_lights: int  # number of light paths, the first ones, whose point on the light is stored as a VPL
     max_bounces: int
     fractional: int  # 1: fractional absorption by `survivors`; 0: Russian roulette by the local albedo
     survivors: wp.array[wp.int32]  # [levels], number of paths that are reflected j times
@@ -119,23 +119,23 @@ def _trace_light_path(
     settings: LightPathSettings,
     i: int,
     vpls: VplBuffer,
-    number: int,
-    step: int,
+    first_number: int,
+    number_stride: int,
     total: int,
-    stored: int,
+    skip: int,
     end: int,
 ) -> int:
-    """Traces light path `i` and returns its number of VPLs on surfaces.
+    """Traces light path `i`, and returns the number n of VPLs that it leaves on surfaces.
 
-    The point on the light is stored in row i of `vpls`. The first VPL on a surface is number `number` of `total`, the
-    next ones follow at distances of `step`. The path's j-th VPL on a surface is stored if stored < j <= end.
+    The VPLs skip + 1 ... min(end, n) are written to `vpls`. The j-th is number first_number + (j - 1) number_stride of
+    `total`, from which `_surface_row` gives its row. With skip = 0 the point on the light is written to row i.
     """
     scene = scene_at(address)[0]
     u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble)
     u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble)
     light = sample_light(scene, u_pick, u)
     path_weight = 1.0 / float(settings.paths)
-    if stored == 0 and i < settings.on_lights:
+    if skip == 0 and i < settings.on_lights:
         vpls.position[i] = light.position
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
@@ -187,8 +187,8 @@ def _trace_light_path(
             survives = _survival_sample(settings.scramble, i, bounce) < probability
         if survives:
             vpl_count += 1
-            if vpl_count > stored and vpl_count <= end:
-                row = _surface_row(settings, number + (vpl_count - 1) * step, total)
+            if vpl_count > skip and vpl_count <= end:
+                row = _surface_row(settings, first_number + (vpl_count - 1) * number_stride, total)
                 if row >= 0:
                     vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
@@ -203,7 +203,7 @@ def _trace_light_path(
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
-def _trace_paths(
+def _trace_light_paths(
     first: int, scene: SceneData, settings: LightPathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
 ) -> None:
     """Traces light path `i`, and records its point on the light and its first VPLs on surfaces.
@@ -223,7 +223,7 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
-def _store_paths(
+def _store_light_paths(
     first: int,
     scene: SceneData,
     settings: LightPathSettings,
@@ -271,7 +271,7 @@ def emit_vpls(
     guide: Guide,
     scratch: Scratch,
     *,
-    paths: int,
+    light_paths: int,
     absorption: str,
     max_bounces: int,
     scramble: int,
@@ -283,19 +283,19 @@ def emit_vpls(
     Args:
         guide: The uploaded scene, and the probabilities by which light paths are guided.
         scratch: Owner of the buffer's arrays; its launcher runs the kernels.
-        paths: Number of VPLs on lights; `guide.paths` times as many light paths are started.
+        light_paths: Number of light paths, and of VPLs on lights; `guide.path_multiplier` times as many are traced.
         absorption: "fractional" or "roulette".
         max_bounces: Largest number of reflections of a light path.
         scramble: 32-bit scramble of the low-discrepancy sequence; two scrambles give independent estimates.
     """
-    scene, launcher, on_lights = guide.scene, scratch.launcher, paths
+    scene, launcher, on_lights = guide.scene, scratch.launcher, light_paths
     if not scene.emits:
         vpls = _buffer(scene, scratch, "vpls", 0, 0)
         vpls.count.zero_()
         return vpls
     settings = LightPathSettings()
     settings.scramble = wp.uint32(scramble)
-    paths *= guide.paths
+    paths = light_paths * guide.path_multiplier
     settings.paths, settings.on_lights = paths, on_lights
     settings.photon_target, settings.importance = guide.photon_target, guide.importance
     settings.max_bounces = max_bounces
@@ -312,11 +312,11 @@ def emit_vpls(
     # path has a maximal length; the few that are longer than what was recorded of them are traced again.
     lengths, ends = scratch.array("lengths", paths, wp.int32), scratch.array("ends", paths, wp.int32)
     traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
-    launcher.launch(_trace_paths, paths, [scene.data, settings, traced, lengths])
+    launcher.launch(_trace_light_paths, paths, [scene.data, settings, traced, lengths])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
     vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.row_count(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
-    launcher.launch(_store_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
+    launcher.launch(_store_light_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
     return vpls
 

@@ -76,8 +76,8 @@ def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, b
         const float facing = b[7][i] - (b[4][i] * dx + b[5][i] * dy + b[6][i] * dz) * inverse;
         const float g = shading * inverse * facing * inverse * inverse;
         const float bounded = g < b[9][i] ? g : b[9][i];
-        const bool seen = (geometric > 0.0f) & (shading > 0.0f) & (facing > 0.0f);
-        f[i] = seen ? bounded * b[8][i] : 0.0f;
+        const bool front_facing = (geometric > 0.0f) & (shading > 0.0f) & (facing > 0.0f);
+        f[i] = front_facing ? bounded * b[8][i] : 0.0f;
     }
     return f;
 """)
@@ -168,10 +168,10 @@ def _shadowed_contribution(
     position: wp.vec4,
     intensity_bounce: wp.vec4,
     per_ray: float,
-    max_bounce: int,
+    max_bounces: int,
 ) -> wp.vec3:
-    """The contribution of a drawn VPL: its colour times V S/M; 0 if it has more than `max_bounce` bounces."""
-    if int(intensity_bounce[3]) > max_bounce:
+    """The contribution of a drawn VPL: its colour times V S/M; 0 if it has more than `max_bounces` bounces."""
+    if int(intensity_bounce[3]) > max_bounces:
         return wp.vec3(0.0)
     modifiers = int(-1)
     if scene.modifier_count > 0:
@@ -196,25 +196,25 @@ def gather(
     x: ShadingPoint,
     u: float,
     rays: int,
-    max_bounce: int,
+    max_bounces: int,
 ) -> wp.vec3:
     """Irradiance [W m⁻²] at a point from the VPLs of all sets, estimated from one set with a few shadow rays.
 
     `address` is `SceneData.address`; `kind` is `ON_LIGHTS` or `ON_SURFACES`. `u_set` in [0, 1) selects the set, `u` in
-    [0, 1) is the offset of the systematic sampling. VPLs of more than `max_bounce` bounces contribute nothing. `rays`
+    [0, 1) is the offset of the systematic sampling. VPLs of more than `max_bounces` bounces contribute nothing. `rays`
     is the number M of shadow rays, at most 8.
     """
     scene = scene_at(address)[0]
     group = vpl_sets[kind]
     set_index = int(u_set * float(group.sets))
     if on_cuda():
-        return _gather_one_by_one(scene, group, set_index, x, u, rays, max_bounce) * float(group.sets)
-    return _gather_in_blocks(scene, group, set_index, x, u, rays, max_bounce) * float(group.sets)
+        return _gather_one_by_one(scene, group, set_index, x, u, rays, max_bounces) * float(group.sets)
+    return _gather_in_blocks(scene, group, set_index, x, u, rays, max_bounces) * float(group.sets)
 
 
 @wp.func
 def _gather_in_blocks(
-    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
+    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounces: int
 ) -> wp.vec3:
     """Two passes over the blocks of a set: the first sums the lanes, the second finds the VPLs at the targets.
 
@@ -255,7 +255,7 @@ def _gather_in_blocks(
                     group.rows[row + 3][lane],
                 )
                 out += _shadowed_contribution(
-                    scene, group, x, slot, p, group.intensity_bounce[slot], per_ray, max_bounce
+                    scene, group, x, slot, p, group.intensity_bounce[slot], per_ray, max_bounces
                 )
             next_target += per_ray
             rays_drawn += 1
@@ -278,7 +278,7 @@ def _count_in_lane(group: VplSets, begin: int, lane: int, x: ShadingPoint, targe
 
 @wp.func
 def _gather_one_by_one(
-    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounce: int
+    scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounces: int
 ) -> wp.vec3:
     """The scalar form, for CUDA: one running sum over the VPLs of a set, with M targets along it.
 
@@ -305,7 +305,7 @@ def _gather_one_by_one(
         slot = slots[k]
         position = group.vpls.position[group.order[slot]]
         out += _shadowed_contribution(
-            scene, group, x, slot, position, intensity_and_bounce(group, slot), per_ray, max_bounce
+            scene, group, x, slot, position, intensity_and_bounce(group, slot), per_ray, max_bounces
         )
     return out
 

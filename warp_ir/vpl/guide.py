@@ -36,7 +36,7 @@ class VplImportance:
     extent: float  # edge length of the cube, which is centred at the origin
     per_intensity: wp.array[
         wp.float32
-    ]  # [sides, cells, cells, cells]; times the sum of the intensity's channels: the survival probability
+    ]  # [sides, cells, cells, cells]; contribution over the threshold of survival, per intensity
 
 
 @wp.func
@@ -72,9 +72,9 @@ class Guide:
     """Where photons of lights at infinity enter the scene."""
     importance: VplImportance
     """Contribution of VPLs, from which their survival probability follows."""
-    paths: int = 1
-    """Number of light paths to start for each that is asked for, to make up for VPLs that do not survive."""
-    density: float = 1.0
+    path_multiplier: int = 1
+    """Number of light paths to trace for each that is asked for, to make up for VPLs that do not survive."""
+    density_ratio: float = 1.0
     """Density of surviving VPLs where they matter, relative to the mean over all surfaces."""
 
 

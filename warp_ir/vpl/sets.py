@@ -27,7 +27,7 @@ _PI = wp.constant(wp.float64(math.pi))
 UNBOUNDED = wp.constant(3.0e38)
 _LAST = wp.constant(2**31 - 1)
 """Sort key of an empty row."""
-_AREAS = wp.constant(wp.float64(20.0))
+_BOUND_AREAS = wp.constant(wp.float64(20.0))
 """The bound takes effect within a disk of this many times the area that a VPL stands for. A smaller value leaves noise
 from VPLs close by; a larger one leaves noise, and costs time, from the compensation rays. The optimum is flat."""
 
@@ -67,7 +67,7 @@ def mean_channel(intensity_bounce: wp.vec3) -> float:
 
 @wp.func
 def bound_of(group: VplSets, vpl: int, normal: wp.vec4) -> float:
-    """The bound on G for one VPL: higher on lights whose VPLs lie dense; none where it shines everywhere alike."""
+    """The bound on G for one VPL: higher on lights whose VPLs lie densely; none for VPLs without a normal."""
     if normal[3] == 1.0:
         return UNBOUNDED
     if vpl < group.vpls.on_lights:
@@ -102,7 +102,7 @@ def _divide_blocks(count: int) -> wp.vec2i:
 
 
 @wp.func
-def _filled_in(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
+def _with_counts(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> VplSets:
     out = group
     out.sets = divided[0]
     out.blocks = divided[1]
@@ -112,17 +112,17 @@ def _filled_in(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) -> V
 
 
 @wp.func
-def _bound(weighed: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
-    """The bound on G where a pixel evaluates `weighed` VPLs, `on_lights` of them on lights.
+def _bound(evaluated: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
+    """The bound on G where a pixel evaluates `evaluated` VPLs, `on_lights` of them on lights.
 
-    A VPL stands for area/weighed of the surfaces. Within a disk of `_AREAS` times that area, G can exceed the bound;
-    `density` says how much denser guided VPLs lie where they matter.
+    A VPL stands for area/evaluated of the surfaces. G can exceed the bound within a disk of `_BOUND_AREAS` times that
+    area. `density` says how much denser guided VPLs lie where they matter.
     """
     out = Bound()
     out.minimum = UNBOUNDED
     if area > wp.float64(0.0):
-        out.minimum = float(_PI * wp.float64(weighed) * density / (_AREAS * area))
-    out.per_pdf_area = float(_PI * wp.float64(on_lights) / _AREAS)
+        out.minimum = float(_PI * wp.float64(evaluated) * density / (_BOUND_AREAS * area))
+    out.per_pdf_area = float(_PI * wp.float64(on_lights) / _BOUND_AREAS)
     return out
 
 
@@ -146,10 +146,10 @@ def _divide_into_sets(
     of_lights = _divide_blocks(vpls.on_lights)
     of_surfaces = _divide_blocks(vpls.count[0] - vpls.on_lights)
     if i == 0:
-        weighed = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
-        bound = _bound(weighed, _LANES * of_lights[1], density, area)
-        vpl_sets[0] = _filled_in(lights, of_lights, vpls.on_lights, bound)
-        vpl_sets[1] = _filled_in(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
+        evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
+        bound = _bound(evaluated, _LANES * of_lights[1], density, area)
+        vpl_sets[0] = _with_counts(lights, of_lights, vpls.on_lights, bound)
+        vpl_sets[1] = _with_counts(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
     lights.order[i] = i
     keys[i] = _LAST
     if i < vpls.count[0]:
@@ -180,19 +180,19 @@ def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
         slot = begin + group.blocks * lane + i % group.blocks
         position = wp.vec4(0.0)
         normal = wp.vec4(0.0)
-        strength = float(0.0)
+        mean_intensity = float(0.0)
         bound = float(UNBOUNDED)
         if slot < group.count:
             vpl = group.order[slot]
             position = group.vpls.position[vpl]
             normal = group.vpls.normal[vpl]
-            strength = mean_channel(group.vpls.intensity[vpl])
+            mean_intensity = mean_channel(group.vpls.intensity[vpl])
             bound = bound_of(group, vpl, normal)
             group.intensity_bounce[slot] = intensity_and_bounce(group, slot)
         for k in range(4):
             group.rows[BLOCK_ROWS * i + k][lane] = position[k]
             group.rows[BLOCK_ROWS * i + 4 + k][lane] = normal[k]
-        group.rows[BLOCK_ROWS * i + 8][lane] = strength
+        group.rows[BLOCK_ROWS * i + 8][lane] = mean_intensity
         group.rows[BLOCK_ROWS * i + 9][lane] = bound
 
 
@@ -229,9 +229,9 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
     scene, launcher = guide.scene, scratch.launcher
     packed = not launcher.device.is_cuda  # on CUDA a thread evaluates VPLs one by one, from the buffer
     # The radix sort needs twice the memory of its data.
-    keys = scratch.array("gather.keys", max(2 * vpls.capacity, 1), wp.int32)
-    order = scratch.array("gather.order", max(2 * vpls.capacity, 1), wp.int32)
-    vpl_sets = scratch.array("gather.parts", 2, VplSets)
+    keys = scratch.array("sets.keys", max(2 * vpls.capacity, 1), wp.int32)
+    order = scratch.array("sets.order", max(2 * vpls.capacity, 1), wp.int32)
+    vpl_sets = scratch.array("sets", 2, VplSets)
     lights, surfaces = VplSets(), VplSets()
     blocks = []
     for group, name, begin, end in (
@@ -241,11 +241,11 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
         most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
         blocks.append(most)
         group.vpls, group.order = vpls, order[begin:] if end > begin else order
-        group.rows = scratch.array(f"gather.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
-        group.intensity_bounce = scratch.array(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
+        group.rows = scratch.array(f"sets.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
+        group.intensity_bounce = scratch.array(f"sets.{name}.intensity_bounce", max(LANES * most, 1), wp.vec4)
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
-        group.shaping = scratch.array(f"gather.{name}.shapes", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
-    inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, vpl_sets]
+        group.shaping = scratch.array(f"sets.{name}.shaping", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
+    inputs = [lights, surfaces, scene.extent, guide.density_ratio, scene.area, keys, vpl_sets]
     launcher.launch(_divide_into_sets, max(vpls.capacity, 1), inputs)  # also without VPLs: counts must become 0
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
     launcher.launch(_pack, sum(blocks), [vpl_sets])

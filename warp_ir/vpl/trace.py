@@ -67,7 +67,7 @@ def trace_vpls(
     vpls = emit_vpls(
         unguided(uploaded, launcher),
         Scratch(launcher),
-        paths=resolved.light_paths,
+        light_paths=resolved.light_paths,
         absorption=resolved.absorption,
         max_bounces=resolved.max_bounces,
         scramble=iteration_scramble(resolved.seed, iteration),
