@@ -12,7 +12,7 @@ from warp_ir.film import Film
 
 @contextmanager
 def cancel_on_signal(launcher: Launcher, film: Film) -> Iterator[None]:
-    """Cancels the launches inside the block on SIGINT or SIGTERM, and sets `film.interrupted` to the number of the signal.
+    """Cancels the launches inside on SIGINT or SIGTERM; `film.interrupted` becomes the number of the signal.
 
     The launches raise `Cancelled` when the current bands of indices are done. Python delivers signals to its main
     thread only; in any other thread this does nothing.

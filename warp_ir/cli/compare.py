@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     scene = reader.read(time_code_of(args))
     if not args.quiet:
         say_warnings(scene.warnings, everything=args.verbose)
-    job = _Job(args, scene, device)
+    job = _Comparison(args, scene, device)
     runs: list[Run] = []
     code, reference = 0, None
     try:
@@ -147,7 +147,7 @@ class _Stopped(BaseException):
         self.code = 128 + number
 
 
-class _Job:
+class _Comparison:
     """The scene and the settings with which its pictures are rendered."""
 
     def __init__(self, args: argparse.Namespace, scene: Scene, device: str) -> None:
@@ -423,7 +423,7 @@ def _plot(rows: Sequence[Run], reference: Reference, title: str, path: Path) -> 
 
 def _write_json(
     path: Path,
-    job: _Job,
+    job: _Comparison,
     reference: Reference,
     runs: Sequence[Run],
     rows: Sequence[Run],

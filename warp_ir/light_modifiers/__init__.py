@@ -10,8 +10,8 @@ from warp_ir.light_modifiers.records import (
     in_link_set,
     shaping_factor,
 )
-from warp_ir.light_modifiers.shaping import shaped_power
-from warp_ir.light_modifiers.upload import upload_light_modifiers
+from warp_ir.light_modifiers.shaping_integrals import shaped_power
+from warp_ir.light_modifiers.upload_modifiers import upload_light_modifiers
 
 __all__ = [
     "LightModifierTables",

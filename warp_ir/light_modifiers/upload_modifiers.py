@@ -9,7 +9,13 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.light_modifiers.records import MODIFIERS_DTYPE, LightModifiers, LightModifierTables
-from warp_ir.light_modifiers.shaping import check_shaping, fit_ramp, integrate_emission, shaping_axis, shaping_frame
+from warp_ir.light_modifiers.shaping_integrals import (
+    check_shaping,
+    fit_ramp,
+    integrate_emission,
+    shaping_axis,
+    shaping_frame,
+)
 from warp_ir.sampling.distribution2d import Distribution2DList
 from warp_ir.scene import Floats, InputError, Light, LightKind, Mesh, MeshLight, Shaping
 
