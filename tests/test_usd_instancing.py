@@ -160,6 +160,115 @@ def test_instancers_nest(tmp_path):
     assert corners(scene)[:, 0, 0].tolist() == [0, 1, 10, 11]
 
 
+def moved(x: float, y: float, z: float, reset: str = "") -> str:
+    """Transform ops: a translation, a rotation and a scale; `reset` goes before them."""
+    return f"""double3 xformOp:translate = ({x}, {y}, {z})
+    float xformOp:rotateZ = 30
+    double3 xformOp:scale = (2, 1, 1)
+    uniform token[] xformOpOrder = [{reset}"xformOp:translate", "xformOp:rotateZ", "xformOp:scale"]"""
+
+
+RESET = '"!resetXformStack!", '
+RESETTING = {
+    "prototype": f'def Mesh "Proto" {{{TRIANGLE} {moved(0, 1, 0, RESET)}\n}}\n',
+    "child": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def Mesh "M" {{{TRIANGLE} {moved(0, 1, 0, RESET)}
+        }}
+    }}""",
+    "grandchild": f"""def Xform "Proto" {{
+        {moved(9, 0, 0, RESET)}
+        def Xform "X" {{
+            {moved(0, 0, 3)}
+            def Mesh "M" {{{TRIANGLE} {moved(0, 1, 0, RESET)}
+            }}
+        }}
+    }}""",
+    "native instance": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def "I" (
+            instanceable = true
+            references = </Asset>
+        ) {{
+        }}
+    }}""",
+    "in an instancer": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def PointInstancer "Q" {{
+            {moved(0, 1, 0, RESET)}
+            rel prototypes = </P/Proto/Q/R>
+            int[] protoIndices = [0, 0]
+            point3f[] positions = [(0, 0, 0), (0, 0, 1)]
+            def Xform "R" {{
+                {moved(0, 3, 0)}
+                def Mesh "M" {{{TRIANGLE} {moved(0, 1, 2, RESET)}
+                }}
+            }}
+        }}
+    }}""",
+}
+
+
+def instance_matrices(stage: Usd.Stage, path: str) -> list[np.ndarray]:
+    """The transforms (row vectors) that an instancer gives to where the stage has the prims of its prototype."""
+    cache, prim = UsdGeom.XformCache(), stage.GetPrimAtPath(path)
+    now = Usd.TimeCode.Default()
+    prototype = stage.GetPrimAtPath(UsdGeom.PointInstancer(prim).GetPrototypesRel().GetTargets()[0])
+    instances = UsdGeom.PointInstancer(prim).ComputeInstanceTransformsAtTime(now, now)
+    to_prototype = np.linalg.inv(np.array(cache.GetLocalToWorldTransform(prototype)))
+    return [to_prototype @ np.array(m) @ np.array(cache.GetLocalToWorldTransform(prim)) for m in instances]
+
+
+@pytest.mark.parametrize("which", RESETTING)
+def test_resetting_the_transform_stack_keeps_all_instances(tmp_path, which):
+    """Instances move a prim from where the stage has it, by XformCache and ComputeInstanceTransformsAtTime."""
+    arrays = """int[] protoIndices = [0, 0, 0]
+    point3f[] positions = [(-2, 0, 0), (0, 0, 0), (2, 0, 0)]
+    quath[] orientations = [(1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
+    float3[] scales = [(1, 1, 1), (1, 2, 1), (3, 1, 1)]
+    """
+    asset = f"""class Xform "Asset" {{
+    {moved(5, 0, 0, RESET)}
+    def Mesh "M" {{{TRIANGLE} {moved(0, 0, 1)}
+    }}
+}}"""
+    scene = load(tmp_path, instancer(arrays + moved(0, 7, 4), RESETTING[which]) + "\n" + asset)
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
+    everything = Usd.PrimRange(stage.GetPrimAtPath("/P"), Usd.TraverseInstanceProxies())
+    (mesh,) = (prim for prim in everything if prim.IsA(UsdGeom.Mesh))
+    matrices = [np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))]
+    for path in ("/P/Proto/Q", "/P") if which == "in an instancer" else ("/P",):
+        matrices = [m @ instance for m in matrices for instance in instance_matrices(stage, path)]
+    triangle = np.array([(0, 0, 0, 1), (1, 0, 0, 1), (0, 1, 0, 1)])
+    expected = np.stack([triangle @ m for m in matrices])[..., :3]
+    assert len(expected) == (6 if which == "in an instancer" else 3)
+    np.testing.assert_allclose(corners(scene), expected[np.lexsort(expected[:, 0].round(9).T)], atol=1e-9)
+
+
+def test_lights_that_reset_the_transform_stack_are_instanced(tmp_path):
+    """So are lights: three of them, 2 apart, above the instances."""
+    light = f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def SphereLight "L" {{
+            double3 xformOp:translate = (0, 1, 0)
+            uniform token[] xformOpOrder = [{RESET}"xformOp:translate"]
+        }}
+    }}"""
+    positions = "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(-2, 0, 0), (0, 0, 0), (2, 0, 0)]"
+    lights = load(tmp_path, instancer(positions, light)).lights
+    assert [light.world_from_light[:3, 3].tolist() for light in lights] == [[x, 1.0, 0.0] for x in (-2.0, 0.0, 2.0)]
+
+
+def test_a_reset_below_a_flat_instancer_is_named(tmp_path):
+    """Where the stage has the prim cannot be told relative to a parent whose transform is singular."""
+    flat = """double3 xformOp:scale = (1, 0, 1)
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+    int[] protoIndices = [0]
+    point3f[] positions = [(0, 0, 0)]"""
+    scene = load(tmp_path, instancer(flat, RESETTING["child"]))
+    assert warned(scene, "/P/Proto/M", "resets", "/P cannot be inverted")
+
+
 def test_a_prototype_that_contains_its_instancer_does_not_loop(tmp_path):
     """Recursion is cut and named."""
     scene = load(
