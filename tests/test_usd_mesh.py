@@ -242,6 +242,31 @@ def test_velocities_carry_points_between_samples(tmp_path, more, time):
         assert points.meshes[0].points[0, 2] == pytest.approx(5.0 * t + (10.0 * t**2 if more else 0.0))
 
 
+@pytest.mark.parametrize("complexity", ["low", "medium"])
+def test_values_of_points_that_change_places_are_those_of_the_sample_before(tmp_path, complexity):
+    """Between samples whose points are in another order, colours, coordinates and normals come with the points."""
+    more = """
+    color3f[] primvars:displayColor (
+        interpolation = "vertex"
+    )
+    color3f[] primvars:displayColor.timeSamples = {
+        0: [(1, 0, 0), (0, 1, 0), (0, 0, 1)], 4: [(0, 0, 1), (1, 0, 0), (0, 1, 0)] }
+    normal3f[] normals.timeSamples = {
+        0: [(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)], 4: [(0, 0.6, 0.8), (0, 0, 1), (0.6, 0, 0.8)] }
+    """
+    text = CACHE % dict(first=FIRST, second="[(0, 1, 9), (0, 0, 9), (1, 0, 9)]", velocities=UPWARD, more=more)
+    scheme = "none" if complexity == "low" else "bilinear"
+    scene = load(tmp_path, text.replace('"none"', f'"{scheme}"'), time=2.0, complexity=complexity)
+    points, colors = (
+        v.reshape(-1, 3) for v in (scene.meshes[0].points[scene.meshes[0].triangles], scene.meshes[0].colors)
+    )
+    assert points[:, 2] == pytest.approx(1.0)  # 0.2 s after the sample, at 5 units per second
+    # Colours are linear over the triangle: red at the origin, green along x, blue along y.
+    assert colors == pytest.approx(np.stack([1 - points[:, 0] - points[:, 1], points[:, 0], points[:, 1]], axis=1))
+    if complexity == "low":
+        assert scene.meshes[0].normals[0] == pytest.approx(np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)]))
+
+
 @pytest.mark.parametrize(
     ("velocities", "word"), [("[(0, 0, 5)]", "1 values for 3 points"), ("[(0,0,nan), (0,0,0), (0,0,0)]", "NaN")]
 )

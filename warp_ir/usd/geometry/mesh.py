@@ -10,7 +10,7 @@ from warp_ir.usd.geometry.refine import Scheme
 from warp_ir.usd.geometry.skinning import DeformedMesh, Skinning
 from warp_ir.usd.geometry.subdivision import read_subdivided
 from warp_ir.usd.geometry.triangulate import triangulate
-from warp_ir.usd.geometry.velocities import extrapolated_points
+from warp_ir.usd.geometry.velocities import motion_after_sample
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh, count_elements, drop_degenerate, with_normals
@@ -33,7 +33,7 @@ def read_mesh(
         InputError: Subdivision would create too many triangles.
     """
     mesh = UsdGeom.Mesh(prim)
-    points = extrapolated_points(*_motion_attributes(mesh), time, report)
+    points, sampled = _points(mesh, time, report)
     counts = read.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = read.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
@@ -54,7 +54,8 @@ def read_mesh(
     scheme = read.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark")
     if scheme != UsdGeom.Tokens.none:
         if levels and scheme in (supported.value for supported in Scheme):
-            return read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+            refined = read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+            return replace(refined, sampled=True) if refined is not None and sampled else refined
         report.warn(
             prim.GetPath(), "subdivision surface rendered as its cage; a higher complexity refines it ({n} in all)"
         )
@@ -67,6 +68,7 @@ def read_mesh(
         face=face,
         corner=corner,
         element_counts=count_elements(points, counts, indices),
+        sampled=sampled,
     )
     return _finish(prim, shape, int(keep.sum()), time, report, deformed)
 
@@ -78,7 +80,7 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points = extrapolated_points(*_motion_attributes(tets), time, report)
+    points, sampled = _points(tets, time, report)
     faces = read.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
     if points is not None and (faces is None or len(faces) == 0):
         cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
@@ -93,16 +95,21 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
     corner, face = triangulate(points, counts, faces.reshape(-1), keep)
     if read.text(tets.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    element_counts = count_elements(points, counts, faces.reshape(-1))
     shape = TriangleMesh(
-        points, faces.reshape(-1).astype(np.int32)[corner], face, corner, element_counts=element_counts
+        *(points, faces.reshape(-1).astype(np.int32)[corner], face, corner),
+        element_counts=count_elements(points, counts, faces.reshape(-1)),
+        sampled=sampled,
     )
     return _finish(prim, shape, int(keep.sum()), time, report)
 
 
-def _motion_attributes(prim: UsdGeom.PointBased) -> tuple[Usd.Attribute, Usd.Attribute, Usd.Attribute]:
-    """The points, velocities and accelerations of a point-based prim."""
-    return prim.GetPointsAttr(), prim.GetVelocitiesAttr(), prim.GetAccelerationsAttr()
+def _points(prim: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> tuple[Floats | None, bool]:
+    """The points [n, 3] of a prim, and whether they are moved by velocities (`TriangleMesh.sampled`)."""
+    attribute = prim.GetPointsAttr()
+    motion = motion_after_sample(attribute, 3, prim.GetVelocitiesAttr(), prim.GetAccelerationsAttr(), time, report)
+    if motion is None:
+        return read.floats(attribute, time, 3), False
+    return motion.start + motion.change, True
 
 
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
@@ -154,7 +161,7 @@ def _with_normals(
         based = UsdGeom.PointBased(prim)
         attribute, interpolation, indices = based.GetNormalsAttr(), based.GetNormalsInterpolation(), None
     try:
-        values = read.floats(attribute, time, 3)
+        values = read.floats(attribute, read.sample_before(attribute, time) if shape.sampled else time, 3)
         if values is None or len(values) == 0 or len(shape.triangles) == 0:
             return shape
         normals = primvar.expand(shape, values, interpolation, indices)

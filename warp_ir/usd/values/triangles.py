@@ -46,6 +46,8 @@ class TriangleMesh:
     """Number of faces without area that were dropped."""
     refiner: PrimvarRefiner | None = None
     """Interpolates primvars over a subdivided surface; None: the surface is not subdivided."""
+    sampled: bool = False
+    """Whether velocities move its points after a time sample: values per element are then those of a sample as well."""
 
     def keep(self, mask: Bools) -> "TriangleMesh":
         """This mesh with only the triangles that the mask [m] selects."""
