@@ -48,6 +48,12 @@ class DrawnPrim:
         """world_from_prim of every instance, float64 [k, 4, 4]."""
         return self.level.world_matrices() @ self.level_from_prim
 
+    def as_instance(self) -> "DrawnPrim":
+        """The same prim as the only instance in a level of its own, which may be stored as a prototype."""
+        path = (self.prim.GetPrimInPrototype() if self.prim.IsInstanceProxy() else self.prim).GetPath()
+        level = InstanceLevel(path, self.level, self.level_from_prim[None])
+        return replace(self, level=level, level_from_prim=np.eye(4))
+
 
 @dataclass(eq=False)
 class DrawnPrims:
