@@ -13,7 +13,7 @@ from warp_ir.usd.geometry.triangulate import triangulate
 from warp_ir.usd.geometry.velocities import motion_after_sample
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.triangles import TriangleMesh, count_elements, drop_degenerate, with_normals
+from warp_ir.usd.values.triangles import Cells, TriangleMesh, count_elements, drop_degenerate, with_normals
 
 
 def read_mesh(
@@ -82,10 +82,10 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
     tets = UsdGeom.TetMesh(prim)
     points, sampled = _points(tets, time, report)
     faces = read.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
-    if points is not None and (faces is None or len(faces) == 0):
-        cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
-        if cells is not None and len(cells):
-            read.check_range(cells, len(points), "tetVertexIndices")
+    cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
+    if points is not None and cells is not None:
+        read.check_range(cells, len(points), "tetVertexIndices")
+        if (faces is None or len(faces) == 0) and len(cells):
             faces = np.asarray(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, time), dtype=np.int64).reshape(-1, 3)
     if points is None or faces is None or len(faces) == 0:
         return None
@@ -99,8 +99,32 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
         *(points, faces.reshape(-1).astype(np.int32)[corner], face, corner),
         element_counts=count_elements(points, counts, faces.reshape(-1)),
         sampled=sampled,
+        cells=None if cells is None or not _has_values_per_cell(prim) else Cells(len(cells), _cells_of(faces, cells)),
     )
     return _finish(prim, shape, int(keep.sum()), time, report)
+
+
+def _has_values_per_cell(prim: Usd.Prim) -> bool:
+    """Whether a TetMesh has anything that refers to its tetrahedra: a uniform primvar, or a GeomSubset of them."""
+    normals = UsdGeom.PointBased(prim).GetNormalsInterpolation()
+    interpolations = [primvar.GetInterpolation() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars()]
+    predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+    return UsdGeom.Tokens.uniform in (normals, *interpolations) or any(
+        child.IsA(UsdGeom.Subset) for child in prim.GetFilteredChildren(predicate)
+    )
+
+
+def _cells_of(faces: Ints, cells: Ints) -> Ints:
+    """For each triangle [f, 3] the first tetrahedron [t, 4] that it is a face of, int [f]; -1: of none."""
+    on_surface = np.zeros(int(max(faces.max(), cells.max(initial=0))) + 1, dtype=bool)
+    on_surface[faces] = True
+    sides = np.sort(cells, axis=1)[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    candidates = np.flatnonzero(on_surface[sides].all(axis=1))
+    rows = np.concatenate([sides[candidates], np.sort(faces, axis=1)])
+    first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)[1:]
+    found = first[inverse.reshape(-1)[len(candidates) :]]
+    padded = np.concatenate([candidates // 4, np.full(len(faces), -1)])
+    return padded[found]
 
 
 def _points(prim: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> tuple[Floats | None, bool]:

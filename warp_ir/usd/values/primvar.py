@@ -27,6 +27,12 @@ def expand(mesh: TriangleMesh, values: Floats, interpolation: str, indices: Ints
         if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
             raise Unreadable(f"an index of the primvar is out of range of its {len(values)} values")
     count = len(values) if indices is None else len(indices)
+    element = mesh.face
+    if mesh.cells is not None and interpolation == UsdGeom.Tokens.uniform and count == mesh.cells.count:
+        element = mesh.cells.of_face[mesh.face]
+        count = len(mesh.cells.of_face)
+        if element.min(initial=0) < 0:
+            raise Unreadable("a surface face is not that of a tetrahedron")
     expected = 1 if interpolation == UsdGeom.Tokens.constant else mesh.element_counts.get(interpolation)
     if expected is None:
         raise Unreadable(f"its interpolation {interpolation} is not defined for this prim")
@@ -39,7 +45,7 @@ def expand(mesh: TriangleMesh, values: Floats, interpolation: str, indices: Ints
     if interpolation == UsdGeom.Tokens.constant:
         return np.broadcast_to(values[0], (*mesh.triangles.shape, values.shape[1]))
     if interpolation == UsdGeom.Tokens.uniform:
-        return np.broadcast_to(values[mesh.face][:, None], (*mesh.triangles.shape, values.shape[1]))
+        return np.broadcast_to(values[element][:, None], (*mesh.triangles.shape, values.shape[1]))
     if interpolation == UsdGeom.Tokens.faceVarying:
         return values[mesh.corner]
     if mesh.refiner is not None:
