@@ -1,6 +1,7 @@
 """Films add, and say how sure they are."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,3 +156,37 @@ def test_timings_and_counts_are_those_of_one_film():
     assert again.counts["primary_rays"] == 3 * 256
     total = sum(film.timings["gather"] for film in films)
     assert total == pytest.approx(renderer.launcher.profile.seconds()["gather"])
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("light", ["dome", "black dome", "rect", "sun"])
+def test_visible_lights_have_alpha(light, tmp_path):
+    """Where the camera sees a light before nothing, alpha is 1: all around in a dome, black parts of its image too."""
+    lights = {
+        "dome": ir.Light("L", ir.LightKind.DOME, (1.0, 1.0, 1.0)),
+        "black dome": ir.Light(
+            "L", ir.LightKind.DOME, (1.0,) * 3, texture=np.eye(2, dtype=np.float32)[..., None].repeat(3, 2)
+        ),
+        "rect": ir.Light(
+            "L", ir.LightKind.RECT, (1.0,) * 3, width=1.0, height=1.0, world_from_light=np.diag([-1.0, 1, -1, 1])
+        ),
+        "sun": ir.Light("L", ir.LightKind.DISTANT, (1.0,) * 3, angle=10.0, world_from_light=np.diag([-1.0, 1, -1, 1])),
+    }
+    points = np.array([(0.5, -9, -0.5), (9, -9, -0.5), (9, 9, -0.5), (0.5, 9, -0.5)], float)
+    mesh = ir.Mesh("m", points, np.array([(0, 1, 2), (0, 2, 3)], np.int32), np.zeros(2, np.int32))
+    camera = ir.Camera.look_at((0, 0, 4), (0, 0, 0))
+    scene = ir.Scene((mesh,), (ir.Material(),), (lights[light],), camera=camera)
+    settings = ir.RenderSettings(width=16, height=16, iterations=4, light_paths=16)
+    hidden = ir.render(scene, settings)
+    film = ir.render(scene, replace(settings, visible_lights=True))
+    hits, alpha = hidden.aov("alpha"), film.aov("alpha")
+    emitted = film._radiance_of("emission").max(axis=-1) > 0.0
+    assert 0.0 < hits.mean() < 1.0 and (alpha >= hits).all()
+    if "dome" in light:
+        assert (alpha == 1.0).all()
+    else:
+        assert (alpha[emitted] > 0.0).all() and (alpha[~emitted] == hits[~emitted]).all() and emitted.any()
+    film.save(tmp_path / "f.npz")
+    np.testing.assert_array_equal(ir.Film.load(tmp_path / "f.npz").aov("alpha"), alpha)
+    with pytest.raises(ir.InputError, match="one without"):
+        film.merge(hidden)

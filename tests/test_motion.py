@@ -10,7 +10,10 @@ import pytest
 
 import warp_ir as ir
 from warp_ir.cli import main
+from warp_ir.device.launcher import Launcher
+from warp_ir.device_scene.upload import upload_scenes
 from warp_ir.procedural import cornell_box
+from warp_ir.usd.geometry.prototypes import MAX_FLATTENED_TRIANGLES
 from warp_ir.usd.load import StageReader
 
 SCENES = Path(__file__).parent.parent / "scenes_usd"
@@ -338,6 +341,104 @@ def test_no_blur_without_motion_or_shutter(tmp_path):
         assert ir.load_usd(write(tmp_path, *parts)).shutter == ()
     scene = ir.load_usd(write(tmp_path, CAMERA % (1, 0.5, AT_4), moving))
     assert scene.shutter == () and any("/C" in line and "is before shutter:open" in line for line in scene.warnings)
+
+
+FLIES = moves("0: (0, 0, 0), 10: (20, 0, 0)")
+FLYING = "vector3f[] velocities.timeSamples = { 0: [(48, 0, 0), (0, 24, 0)], 10: [(0, 0, 0), (0, 0, 0)] }"
+INSTANCER = """def PointInstancer "P" {
+    int[] protoIndices = [0, 0]
+    point3f[] positions.timeSamples = { 0: [(0, 0, 0), (5, 0, 0)], 10: [(0, 0, 0), (1, 1, 1)] }
+    rel prototypes = </P/Q>
+    %s
+    %s
+}
+"""
+ASSET = f'class Xform "Asset" {{\n {quad("Q")} }}\n'
+NATIVE = """def Xform "%s" (
+    instanceable = true
+    references = </Asset>
+) { %s
+}
+"""
+MOVING = {
+    "mesh": quad("Q", FLIES),
+    "child": xform(FLIES, quad("Q", moves("0: (0, 1, 0)")) + quad("R")),
+    "native instance": ASSET + NATIVE % ("N", FLIES),
+    "native instances": ASSET + xform(FLIES, NATIVE % ("N", "") + NATIVE % ("O", moves("0: (0, 0, 3)"))),
+    "child of native instances": ASSET.replace("]\n    \n}", f"]\n    {FLIES}\n}}")
+    + NATIVE % ("N", "")
+    + NATIVE % ("O", moves("0: (0, 0, 3)")),
+    "point instances": INSTANCER % (FLYING, quad("Q")),
+    "nested instances": INSTANCER.replace('"P"', '"O"').replace("</P/Q>", "</O/P>")
+    % ("", (INSTANCER % (FLYING, quad("Q"))).replace("</P/Q>", "</O/P/Q>")),
+}
+
+
+@pytest.mark.parametrize("what", MOVING)
+def test_what_moves_rigidly_is_stored_once(tmp_path, what, monkeypatch):
+    """At every shutter sample all is where it is when written out, and the meshes are those of the first sample."""
+    file = write(tmp_path, CAMERA % (0, 1, AT_4), MOVING[what])
+    flat = ir.load_usd(file, time=2.0).shutter
+    monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", 0)
+    stored = ir.load_usd(file, time=2.0).shutter
+    assert len(flat) == len(stored) == MOMENTS
+    for one, other in zip(flat, stored, strict=True):
+        assert one.instances == () and len(other.instances) == (2 if what == "child" else 1)
+        corners = [
+            np.concatenate([mesh.points[mesh.triangles].reshape(-1, 9) for mesh in scene.meshes])
+            for scene in (one, other.flat())
+        ]
+        rows = [found[np.lexsort(found.round(6).T)] for found in corners]
+        np.testing.assert_allclose(rows[1], rows[0], atol=1e-12)
+        # A child that moves in a native prototype, or an instance in a prototype, is part of the mesh.
+        if what not in ("child of native instances", "nested instances"):
+            assert all(mesh is first for mesh, first in zip(other.meshes, stored[0].meshes, strict=True))
+
+
+def test_moving_instances_take_the_memory_of_one_prototype(tmp_path):
+    """What counts is the triangles of all shutter samples: 100 spheres, a matrix each and for each of 16 samples."""
+    count = 100
+    places = [(3.0 * k, 0.0, 0.0) for k in range(count)]
+    more = f"""
+    int[] protoIndices = {[0] * count}
+    point3f[] positions.timeSamples = {{ 0: {places}, 10: {places} }}
+    vector3f[] velocities.timeSamples = {{ 0: {[(0.0, 24.0, 0.0)] * count}, 10: {places} }}
+    rel prototypes = </P/S>
+    def Sphere "S" {{
+    }}
+"""
+    file = write(tmp_path, CAMERA % (-0.5, 0.5, AT_4), f'def PointInstancer "P" {{{more}}}')
+    scene = ir.load_usd(file, time=2.0)
+    (mesh,) = scene.shutter[0].meshes
+    assert count * len(mesh.triangles) < MAX_FLATTENED_TRIANGLES  # of one sample, and of all sixteen:
+    assert MOMENTS * count * len(mesh.triangles) > MAX_FLATTENED_TRIANGLES
+    assert len(ir.load_usd(file, time=2.0, motion_blur=False).instances) == 0
+    for k, sample in enumerate(scene.shutter):
+        assert sample.meshes[0] is mesh and sample.triangle_count == len(mesh.triangles)
+        (group,) = sample.instances
+        # One unit per time code, 24 of which are a second; samples are at the midpoints of parts of the interval.
+        np.testing.assert_allclose(group.matrices[:, 1, 3], 2.0 - 0.5 + (k + 0.5) / MOMENTS, atol=1e-12)
+    uploaded = upload_scenes(scene.shutter, Launcher("cpu"))
+    assert {each.data.triangle_count for each in uploaded} == {len(mesh.triangles)}
+    assert {each.data.instance_count for each in uploaded} == {count}
+
+
+@pytest.mark.extended
+def test_stored_instances_blur_as_if_written_out(tmp_path, monkeypatch):
+    """The same paths, up to rounding: the pictures agree but for pixels where a ray passes an edge."""
+    lamp = 'def SphereLight "L" { float inputs:intensity = 30\n double3 xformOp:translate = (0, 2, 3)\n'
+    lamp += 'uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+    slow = MOVING["point instances"].replace("(48, 0, 0), (0, 24, 0)", "(12, 0, 0), (-24, 24, 0)")
+    file = write(tmp_path, CAMERA % (-0.5, 0.5, AT_4), lamp, slow, quad("Wall", moves("0: (0, 0, -1)")))
+    settings = ir.RenderSettings(width=32, height=32, iterations=32, light_paths=64)
+    pictures = []
+    for limit in (2**20, 0):
+        monkeypatch.setattr("warp_ir.usd.geometry.prototypes.MAX_FLATTENED_TRIANGLES", limit)
+        scene = ir.load_usd(file, time=1.0)
+        assert bool(scene.shutter[0].instances) == (limit == 0)
+        pictures.append(ir.render(scene, settings).radiance())
+    different = np.abs(pictures[0] - pictures[1]).max(axis=-1) > 1e-3 * pictures[0].mean()
+    assert different.mean() < 0.01 and pictures[1].mean() == pytest.approx(pictures[0].mean(), rel=1e-3)
 
 
 def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):

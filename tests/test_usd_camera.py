@@ -200,3 +200,19 @@ def test_a_tiny_scene_is_framed_from_beyond_the_near_plane(tmp_path):
     """As in usdrecord, the camera steps back by 1 where it would stand closer than its near plane."""
     distance = load(tmp_path, 'def Cube "C" { double size = 0.01\n}').camera.world_from_camera[2, 3]
     assert distance == pytest.approx(1 + 0.01 * math.sqrt(0.5) / (0.5 * 20.955 / 50) + 0.005)
+
+
+def test_two_cameras_of_one_name_are_an_error(tmp_path):
+    """The error names both paths; a path chooses one of them."""
+    text = "".join(f'def Xform "{group}" {{ def Camera "Cam" {{\n}}\n }}\n' for group in "AB")
+    with pytest.raises(InputError, match="2 cameras are named 'Cam': /A/Cam, /B/Cam"):
+        load(tmp_path, text, camera="Cam")
+    assert load(tmp_path, text, camera="/B/Cam").camera.name == "/B/Cam"
+    assert warned(load(tmp_path, text.replace('"Cam"', '"main_cam"')), "/A/main_cam", "2 cameras named main_cam")
+
+
+def test_two_render_passes_of_one_name_are_an_error(tmp_path):
+    """So it is with render passes."""
+    text = "".join(f'def Xform "{group}" {{ def RenderPass "Beauty" {{\n}}\n }}\n' for group in "AB")
+    with pytest.raises(InputError, match="2 render passes are named 'Beauty': /A/Beauty, /B/Beauty"):
+        load(tmp_path, text, render_pass="Beauty")

@@ -160,6 +160,115 @@ def test_instancers_nest(tmp_path):
     assert corners(scene)[:, 0, 0].tolist() == [0, 1, 10, 11]
 
 
+def moved(x: float, y: float, z: float, reset: str = "") -> str:
+    """Transform ops: a translation, a rotation and a scale; `reset` goes before them."""
+    return f"""double3 xformOp:translate = ({x}, {y}, {z})
+    float xformOp:rotateZ = 30
+    double3 xformOp:scale = (2, 1, 1)
+    uniform token[] xformOpOrder = [{reset}"xformOp:translate", "xformOp:rotateZ", "xformOp:scale"]"""
+
+
+RESET = '"!resetXformStack!", '
+RESETTING = {
+    "prototype": f'def Mesh "Proto" {{{TRIANGLE} {moved(0, 1, 0, RESET)}\n}}\n',
+    "child": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def Mesh "M" {{{TRIANGLE} {moved(0, 1, 0, RESET)}
+        }}
+    }}""",
+    "grandchild": f"""def Xform "Proto" {{
+        {moved(9, 0, 0, RESET)}
+        def Xform "X" {{
+            {moved(0, 0, 3)}
+            def Mesh "M" {{{TRIANGLE} {moved(0, 1, 0, RESET)}
+            }}
+        }}
+    }}""",
+    "native instance": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def "I" (
+            instanceable = true
+            references = </Asset>
+        ) {{
+        }}
+    }}""",
+    "in an instancer": f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def PointInstancer "Q" {{
+            {moved(0, 1, 0, RESET)}
+            rel prototypes = </P/Proto/Q/R>
+            int[] protoIndices = [0, 0]
+            point3f[] positions = [(0, 0, 0), (0, 0, 1)]
+            def Xform "R" {{
+                {moved(0, 3, 0)}
+                def Mesh "M" {{{TRIANGLE} {moved(0, 1, 2, RESET)}
+                }}
+            }}
+        }}
+    }}""",
+}
+
+
+def instance_matrices(stage: Usd.Stage, path: str) -> list[np.ndarray]:
+    """The transforms (row vectors) that an instancer gives to where the stage has the prims of its prototype."""
+    cache, prim = UsdGeom.XformCache(), stage.GetPrimAtPath(path)
+    now = Usd.TimeCode.Default()
+    prototype = stage.GetPrimAtPath(UsdGeom.PointInstancer(prim).GetPrototypesRel().GetTargets()[0])
+    instances = UsdGeom.PointInstancer(prim).ComputeInstanceTransformsAtTime(now, now)
+    to_prototype = np.linalg.inv(np.array(cache.GetLocalToWorldTransform(prototype)))
+    return [to_prototype @ np.array(m) @ np.array(cache.GetLocalToWorldTransform(prim)) for m in instances]
+
+
+@pytest.mark.parametrize("which", RESETTING)
+def test_resetting_the_transform_stack_keeps_all_instances(tmp_path, which):
+    """Instances move a prim from where the stage has it, by XformCache and ComputeInstanceTransformsAtTime."""
+    arrays = """int[] protoIndices = [0, 0, 0]
+    point3f[] positions = [(-2, 0, 0), (0, 0, 0), (2, 0, 0)]
+    quath[] orientations = [(1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
+    float3[] scales = [(1, 1, 1), (1, 2, 1), (3, 1, 1)]
+    """
+    asset = f"""class Xform "Asset" {{
+    {moved(5, 0, 0, RESET)}
+    def Mesh "M" {{{TRIANGLE} {moved(0, 0, 1)}
+    }}
+}}"""
+    scene = load(tmp_path, instancer(arrays + moved(0, 7, 4), RESETTING[which]) + "\n" + asset)
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
+    everything = Usd.PrimRange(stage.GetPrimAtPath("/P"), Usd.TraverseInstanceProxies())
+    (mesh,) = (prim for prim in everything if prim.IsA(UsdGeom.Mesh))
+    matrices = [np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))]
+    for path in ("/P/Proto/Q", "/P") if which == "in an instancer" else ("/P",):
+        matrices = [m @ instance for m in matrices for instance in instance_matrices(stage, path)]
+    triangle = np.array([(0, 0, 0, 1), (1, 0, 0, 1), (0, 1, 0, 1)])
+    expected = np.stack([triangle @ m for m in matrices])[..., :3]
+    assert len(expected) == (6 if which == "in an instancer" else 3)
+    np.testing.assert_allclose(corners(scene), expected[np.lexsort(expected[:, 0].round(9).T)], atol=1e-9)
+
+
+def test_lights_that_reset_the_transform_stack_are_instanced(tmp_path):
+    """So are lights: three of them, 2 apart, above the instances."""
+    light = f"""def Xform "Proto" {{
+        {moved(9, 0, 0)}
+        def SphereLight "L" {{
+            double3 xformOp:translate = (0, 1, 0)
+            uniform token[] xformOpOrder = [{RESET}"xformOp:translate"]
+        }}
+    }}"""
+    positions = "int[] protoIndices = [0, 0, 0]\n point3f[] positions = [(-2, 0, 0), (0, 0, 0), (2, 0, 0)]"
+    lights = load(tmp_path, instancer(positions, light)).lights
+    assert [light.world_from_light[:3, 3].tolist() for light in lights] == [[x, 1.0, 0.0] for x in (-2.0, 0.0, 2.0)]
+
+
+def test_a_reset_below_a_flat_instancer_is_named(tmp_path):
+    """Where the stage has the prim cannot be told relative to a parent whose transform is singular."""
+    flat = """double3 xformOp:scale = (1, 0, 1)
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+    int[] protoIndices = [0]
+    point3f[] positions = [(0, 0, 0)]"""
+    scene = load(tmp_path, instancer(flat, RESETTING["child"]))
+    assert warned(scene, "/P/Proto/M", "resets", "/P cannot be inverted")
+
+
 def test_a_prototype_that_contains_its_instancer_does_not_loop(tmp_path):
     """Recursion is cut and named."""
     scene = load(
@@ -596,13 +705,68 @@ def test_velocities_carry_instances_between_samples(tmp_path, time):
     float3[] scales = [(1, 2, 3), (1, 1, 1)]
 """)
     scene = load(tmp_path, text, time=time)
-    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
-    instances = UsdGeom.PointInstancer(stage.GetPrimAtPath("/P"))
-    at = Usd.TimeCode(time)
-    places = instances.ComputeInstanceTransformsAtTime(at, at, UsdGeom.PointInstancer.ExcludeProtoXform)
+    np.testing.assert_allclose(corners(scene), by_usd(tmp_path, time), atol=2e-3)
+
+
+CHANGING = """
+    int[] protoIndices.timeSamples = { 1: [0, 0], 2: [0, 0] }
+    point3f[] positions.timeSamples = { 1: [(0, 0, 0), (10, 0, 0)], 2: [(11, 0, 0), (0, 1, 0)] }
+    float3[] scales.timeSamples = { 1: [(1, 1, 1), (4, 4, 4)], 2: [(4, 4, 4), (1, 1, 1)] }
+    quath[] orientations.timeSamples = { 1: [(1, 0, 0, 0), (0, 0, 0, 1)], 2: [(0, 0, 0, 1), (1, 0, 0, 0)] }
+    int64[] ids.timeSamples = { 1: [7, 8], 2: [8, 7] }
+    color3f[] primvars:displayColor (
+        interpolation = "vertex"
+    )
+    color3f[] primvars:displayColor.timeSamples = { 1: [(1, 0, 0), (0, 0, 1)], 2: [(0, 0, 1), (1, 0, 0)] }
+"""
+FLYING = "vector3f[] velocities.timeSamples = { 1: [(0, 24, 0), (24, 0, 0)], 2: [(24, 0, 0), (0, 24, 0)] }\n"
+TURNING = "vector3f[] angularVelocities.timeSamples = { 1: [(0, 0, 0), (0, 0, 240)], 2: [(0, 0, 240), (0, 0, 0)] }\n"
+
+
+@pytest.mark.parametrize("hidden", [7, 8, None])
+@pytest.mark.parametrize("time", [1.0, 1.5, 1.75, 2.0, 2.5])
+def test_instances_that_change_places_keep_what_is_theirs(tmp_path, time, hidden):
+    """With velocities, all that an instance has comes from the sample that its position comes from.
+
+    A red triangle of size 1 flies up, at 24 units per second and 24 time codes per second: one unit per time code; a
+    blue one of size 4, turned by 180 degrees, flies to the right. They change places in the arrays at time 2.
+    """
+    invisible = "" if hidden is None else f"int64[] invisibleIds = [{hidden}]\n"
+    text = "(\n    endTimeCode = 3\n)\n" + instancer(CHANGING + FLYING + invisible)
+    (found,) = load(tmp_path, text, time=time).meshes
+    where = {7: ((0.0, time - 1.0, 0.0), 1.0, (1, 0, 0)), 8: ((9.0 + time, 0.0, 0.0), -4.0, (0, 0, 1))}
+    expected = [where[id] for id in where if id != hidden]
+    if time >= 2.0:
+        expected = expected[::-1]
+    for k, (place, size, color) in enumerate(expected):
+        points = found.points[found.triangles[k]]
+        np.testing.assert_allclose(points, np.add(place, [(0, 0, 0), (size, 0, 0), (0, size, 0)]), atol=1e-6)
+        np.testing.assert_allclose(found.colors[k], [color] * 3, atol=1e-6)
+
+
+@pytest.mark.parametrize("rates", ["", FLYING, TURNING, FLYING + TURNING], ids=["none", "linear", "angular", "both"])
+@pytest.mark.parametrize("time", [0.5, 1.0, 1.25, 2.0, 3.0])
+def test_instances_move_between_samples_as_usd_says(tmp_path, rates, time):
+    """ComputeInstanceTransformsAtTime agrees: nothing is interpolated if velocities of either kind apply."""
+    text = "(\n    endTimeCode = 3\n)\n" + instancer(CHANGING + rates)
+    # Orientations are interpolated in half precision: 2^-11 of an edge of length 4.
+    np.testing.assert_allclose(corners(load(tmp_path, text, time=time)), by_usd(tmp_path, time), atol=2e-3)
+
+
+def test_scales_with_fewer_samples_are_those_before(tmp_path):
+    """At time 2, a sample of the positions but not of the scales, these are the ones of time 1."""
+    text = instancer(CHANGING.replace("4, 4)], 2:", "4, 4)], 3:") + FLYING)
+    assert "3: [(4, 4, 4)" in text
+    np.testing.assert_allclose(corners(load(tmp_path, text, time=2.0)), by_usd(tmp_path, 2.0), atol=1e-5)
+
+
+def by_usd(folder: Path, time: float) -> np.ndarray:
+    """The `corners` of `stage.usda` by ComputeInstanceTransformsAtTime."""
+    stage = Usd.Stage.Open(str(folder / "stage.usda"))
+    places = UsdGeom.PointInstancer(stage.GetPrimAtPath("/P")).ComputeInstanceTransformsAtTime(time, time)
     triangle = np.array([(0, 0, 0, 1), (1, 0, 0, 1), (0, 1, 0, 1)])
-    expected = np.stack([triangle @ np.array(place) for place in places])[..., :3]
-    np.testing.assert_allclose(corners(scene), expected[np.lexsort(expected[:, 0].round(9).T)], atol=2e-3)
+    points = np.stack([triangle @ np.array(place) for place in places])[..., :3]
+    return points[np.lexsort(points[:, 0].round(9).T)]
 
 
 def test_bad_angular_velocities_are_named(tmp_path):

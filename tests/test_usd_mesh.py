@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
 
-from tests.stages import SQUARE, area, area_vectors, load, mesh_text, volume, warned
+from tests.stages import SQUARE, area, area_vectors, diffuse, load, mesh_text, volume, warned
 
 L_SHAPE = [(0, 0, 0), (3, 0, 0), (3, 1, 0), (1, 1, 0), (1, 3, 0), (0, 3, 0)]  # area 5
 DART = [(0, 0, 0), (2, 0, 0), (0.5, 0.5, 0), (0, 2, 0)]  # reflex at 2; area 1
@@ -213,6 +213,47 @@ def test_the_surface_of_tetrahedra(tmp_path):
         assert volume(load(tmp_path, tet % more).meshes[0]) == pytest.approx(1 / 6)
 
 
+TWO_TETRAHEDRA = """def TetMesh "T" {
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)]
+    int4[] tetVertexIndices = [(0, 1, 2, 3), (0, 2, 1, 4)]
+    %s
+}
+"""
+SURFACE = "int3[] surfaceFaceVertexIndices = [(0, 1, 4), (0, 1, 3), (0, 3, 2), (1, 2, 3), (1, 4, 2), (0, 2, 4)]\n"
+
+
+@pytest.mark.parametrize("surface", ["", SURFACE])
+def test_uniform_values_of_tetrahedra_are_theirs(tmp_path, surface):
+    """Each surface face has the colour of its tetrahedron: red above, blue below."""
+    colors = "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)] (\n interpolation = 'uniform'\n)"
+    mesh = load(tmp_path, TWO_TETRAHEDRA % (surface + colors)).meshes[0]
+    assert len(mesh.triangles) == 6
+    above = mesh.points[mesh.triangles].mean(axis=1)[:, 2] > 0.0
+    np.testing.assert_array_equal(mesh.colors[:, 0], np.where(above[:, None], [1, 0, 0], [0, 0, 1]))
+
+
+def test_uniform_values_of_a_tet_mesh_may_be_those_of_its_surface(tmp_path):
+    """As many colours as surface faces belong to these, in their order, as Storm draws them."""
+    shades = [round(0.1 * (k + 1), 1) for k in range(6)]
+    colors = f"color3f[] primvars:displayColor = {[(x, x, x) for x in shades]} (\n interpolation = 'uniform'\n)"
+    mesh = load(tmp_path, TWO_TETRAHEDRA % (SURFACE + colors)).meshes[0]
+    assert mesh.colors[:, 0, 0] == pytest.approx(shades)
+
+
+def test_materials_of_tetrahedra(tmp_path):
+    """A GeomSubset of tetrahedra binds its material to their faces."""
+    subset = """def GeomSubset "S" (prepend apiSchemas = ["MaterialBindingAPI"]) {
+        uniform token elementType = "tetrahedron"
+        uniform token familyName = "materialBind"
+        int[] indices = [1]
+        rel material:binding = </A>
+    }"""
+    scene = load(tmp_path, TWO_TETRAHEDRA % subset + diffuse("(0, 1, 0)"))
+    mesh = scene.meshes[0]
+    green = [scene.materials[k].albedo == (0.0, 1.0, 0.0) for k in mesh.material]
+    assert green == (mesh.points[mesh.triangles].mean(axis=1)[:, 2] < 0.0).tolist()
+
+
 CACHE = """(
     timeCodesPerSecond = 10
 )
@@ -240,6 +281,31 @@ def test_velocities_carry_points_between_samples(tmp_path, more, time):
     if 0.0 <= time < 4.0:
         t = time / 10.0
         assert points.meshes[0].points[0, 2] == pytest.approx(5.0 * t + (10.0 * t**2 if more else 0.0))
+
+
+@pytest.mark.parametrize("complexity", ["low", "medium"])
+def test_values_of_points_that_change_places_are_those_of_the_sample_before(tmp_path, complexity):
+    """Between samples whose points are in another order, colours, coordinates and normals come with the points."""
+    more = """
+    color3f[] primvars:displayColor (
+        interpolation = "vertex"
+    )
+    color3f[] primvars:displayColor.timeSamples = {
+        0: [(1, 0, 0), (0, 1, 0), (0, 0, 1)], 4: [(0, 0, 1), (1, 0, 0), (0, 1, 0)] }
+    normal3f[] normals.timeSamples = {
+        0: [(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)], 4: [(0, 0.6, 0.8), (0, 0, 1), (0.6, 0, 0.8)] }
+    """
+    text = CACHE % dict(first=FIRST, second="[(0, 1, 9), (0, 0, 9), (1, 0, 9)]", velocities=UPWARD, more=more)
+    scheme = "none" if complexity == "low" else "bilinear"
+    scene = load(tmp_path, text.replace('"none"', f'"{scheme}"'), time=2.0, complexity=complexity)
+    points, colors = (
+        v.reshape(-1, 3) for v in (scene.meshes[0].points[scene.meshes[0].triangles], scene.meshes[0].colors)
+    )
+    assert points[:, 2] == pytest.approx(1.0)  # 0.2 s after the sample, at 5 units per second
+    # Colours are linear over the triangle: red at the origin, green along x, blue along y.
+    assert colors == pytest.approx(np.stack([1 - points[:, 0] - points[:, 1], points[:, 0], points[:, 1]], axis=1))
+    if complexity == "low":
+        assert scene.meshes[0].normals[0] == pytest.approx(np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)]))
 
 
 @pytest.mark.parametrize(

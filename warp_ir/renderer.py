@@ -30,7 +30,7 @@ from warp_ir.interrupt import cancel_on_signal
 from warp_ir.memory import pixel_bytes
 from warp_ir.reconstruction import BLUR_MODULES, FILTER_MODULES, SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling.sobol import stratum
-from warp_ir.scene import InputError, Scene
+from warp_ir.scene import InputError, LightKind, Scene
 from warp_ir.scheduling import AdaptiveScheduler, Progress
 from warp_ir.settings import GuidingSettings, RenderSettings
 
@@ -108,6 +108,9 @@ class Renderer:
             self.launcher,
             first.scene.frame,
             has_emission=self._layout.emission,
+            sees_lights=self._resolved.visible_lights,
+            sees_dome=self._resolved.visible_lights
+            and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
         )
         film.settings = self.settings
         if self._resolved.filter:

@@ -29,6 +29,7 @@ class FilmData:
     position: wp.array[wp.vec3]
     depth: wp.array[wp.float32]
     hits: wp.array[wp.int32]  # iterations in which the camera ray met a surface
+    lights: wp.array[wp.int32]  # those in which it met lights alone; no rows if the camera sees no lights
     rejected: wp.array[wp.int32]  # iterations whose radiance was not finite
     mesh: wp.array[wp.int32]  # index into Scene.meshes, from the first iteration; -1: background
 
@@ -66,9 +67,10 @@ def _add_iteration(
     first: int,
     gbuffer: GBuffer,
     exposure: float,
+    dome: int,
     film: FilmData,
 ) -> None:
-    """Adds the estimates of one iteration to the pixel's means and sums."""
+    """Adds the estimates of one iteration to the pixel's means and sums; `dome` is 1 if the camera sees a dome."""
     i = pixel_at(gbuffer.tiles, first + wp.tid())
     if i < 0:
         return
@@ -93,6 +95,8 @@ def _add_iteration(
     film.count[i] = before + 1
     if before == 0:
         film.mesh[i] = gbuffer.mesh[i]
+    if film.lights.shape[0] > 0 and gbuffer.mesh[i] < 0 and (dome == 1 or wp.max(gbuffer.emission[i]) > 0.0):
+        film.lights[i] += 1
     if gbuffer.mesh[i] >= 0:
         film.hits[i] += 1
         film.albedo[i] += gbuffer.albedo[i]
@@ -101,14 +105,14 @@ def _add_iteration(
         film.depth[i] += gbuffer.depth[i]
 
 
-def new_film_data(pixels: int, has_emission: bool, launcher: Launcher) -> FilmData:
-    """An empty `FilmData`; `has_emission` says whether the camera may see emission."""
+def new_film_data(pixels: int, has_emission: bool, sees_lights: bool, launcher: Launcher) -> FilmData:
+    """An empty `FilmData`; the flags say whether the camera may see emission, and lights that are no surfaces."""
     data = FilmData()
     for name in ("emission", "direct", "indirect", "standard_deviation", "albedo", "normal", "position"):
         setattr(data, name, launcher.zeros(pixels if has_emission or name != "emission" else 0, wp.vec3))
     data.depth = launcher.zeros(pixels, wp.float32)
-    for name in ("count", "hits", "rejected", "mesh"):
-        setattr(data, name, launcher.zeros(pixels, wp.int32))
+    for name in ("count", "hits", "lights", "rejected", "mesh"):
+        setattr(data, name, launcher.zeros(pixels if sees_lights or name != "lights" else 0, wp.int32))
     return data
 
 
@@ -117,6 +121,9 @@ def film_arrays(data: FilmData) -> dict[str, wp.array[Any]]:
     return {name: getattr(data, name) for name in FIELDS}
 
 
-def add_samples(gbuffer: GBuffer, exposure: float, film: FilmData, launcher: Launcher) -> None:
-    """Adds one iteration, the tiles of a `GBuffer` that an estimator has filled, to a `FilmData`."""
-    launcher.launch(_add_iteration, indices(gbuffer.tiles), [gbuffer, exposure, film])
+def add_samples(gbuffer: GBuffer, exposure: float, dome: bool, film: FilmData, launcher: Launcher) -> None:
+    """Adds one iteration, the tiles of a `GBuffer` that an estimator has filled, to a `FilmData`.
+
+    `dome` says whether camera rays that leave the scene meet a dome that is visible.
+    """
+    launcher.launch(_add_iteration, indices(gbuffer.tiles), [gbuffer, exposure, int(dome), film])

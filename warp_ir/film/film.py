@@ -64,6 +64,8 @@ class Film:
         frame: DeviceFrame | None = None,
         *,
         has_emission: bool = True,
+        sees_lights: bool = False,
+        sees_dome: bool = False,
     ) -> None:
         """Makes an empty film on the launcher's device.
 
@@ -74,6 +76,8 @@ class Film:
             frame: Device frame of the scene, which takes positions and depths back to world space; None: they stay
                 as they are.
             has_emission: Whether the camera may see emission.
+            sees_lights: Whether it may see lights that are no surfaces; then it may see emission.
+            sees_dome: Whether a dome is among them.
         """
         self.width, self.height = width, height
         self.iterations = 0
@@ -94,7 +98,8 @@ class Film:
         self._denoised: tuple[int, Image] | None = None
         self._frame = frame or DeviceFrame(np.zeros(3), 1.0)
         self._launcher = launcher
-        self._data = new_film_data(width * height, has_emission, launcher)
+        self._data = new_film_data(width * height, has_emission, sees_lights, launcher)
+        self._sees_dome = sees_dome
         self._skipped: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
         self.chosen: npt.NDArray[np.bool_] = np.ones(len(self._skipped), bool)
         """[tiles], whether the next iteration is for a tile of 8 x 8 pixels; row by row."""
@@ -116,7 +121,7 @@ class Film:
 
         With motion blur, `shutter_sample` is the number of the shutter sample that it was made at.
         """
-        add_samples(gbuffer, exposure, self._data, self._launcher)
+        add_samples(gbuffer, exposure, self._sees_dome, self._data, self._launcher)
         if self.reconstruction is not None:
             self.reconstruction.accumulate(gbuffer, shutter_sample)
         self.iterations += 1
@@ -128,12 +133,13 @@ class Film:
         """Adds another film of the same picture, which must come from other iterations or another seed.
 
         Raises:
-            InputError: The films differ in size, or only one of them stores emission.
+            InputError: The films differ in size, or only one of them stores emission, or sees lights.
         """
         if (self.width, self.height) != (other.width, other.height):
             raise InputError(f"film: cannot merge {other.width}x{other.height} into {self.width}x{self.height} pixels")
-        if self._data.emission.shape != other._data.emission.shape:
-            raise InputError("film: cannot merge a film with emission and one without")
+        for name, what in (("emission", "emission"), ("lights", "visible lights")):
+            if getattr(self._data, name).shape != getattr(other._data, name).shape:
+                raise InputError(f"film: cannot merge a film with {what} and one without")
         if other.iterations == 0:
             return
         n, m = (film._data.count.numpy().astype(np.float64) for film in (self, other))
@@ -268,8 +274,8 @@ class Film:
         "direct" (emitted, or reflected once) and "indirect" [h, w, 3] add up to the radiance, unless it is denoised.
         "albedo", "normal" (shading normal, unit), "position" (world space) [h, w, 3] and "depth" (along the camera's
         axis, scene units) [h, w] are means over the surface samples of the pixel, 0 where there are none. "alpha"
-        [h, w] is the fraction of the samples that hit a surface. "prim_id" int32 [h, w] is the index into
-        `Scene.meshes` that the first iteration hit, -1 for the background.
+        [h, w] is the fraction of the samples that hit a surface, or a light that the camera sees. "prim_id" int32
+        [h, w] is the index into `Scene.meshes` that the first iteration hit, -1 for the background.
 
         Raises:
             InputError: There is no such AOV.
@@ -287,6 +293,8 @@ class Film:
         hits = self._data.hits.numpy().reshape(shape)
         if name == "alpha":
             count = self._data.count.numpy().reshape(shape)
+            if self._data.lights.shape[0] > 0:
+                hits = hits + self._data.lights.numpy().reshape(shape)
             return np.asarray((hits / np.maximum(count, 1)).astype(np.float32))
         if name not in AOV_NAMES:
             raise InputError(f"aov: there is no {name!r}; there are {', '.join(AOV_NAMES)}")
@@ -346,8 +354,8 @@ class Film:
         """
         state = read_state(path)
         stored = read_arrays(path, FIELDS)
-        has_emission = len(stored["emission"]) > 0
-        film = Film(state.width, state.height, Launcher(device), state.frame, has_emission=has_emission)
+        rows = {"has_emission": len(stored["emission"]) > 0, "sees_lights": len(stored["lights"]) > 0}
+        film = Film(state.width, state.height, Launcher(device), state.frame, **rows)
         film._restore(state, film_arrays(film._data), stored)
         return film
 

@@ -77,6 +77,7 @@ def build_meshes(
     metals: str = "diffuse",
     purposes: Sequence[str] = PURPOSES[:2],
     links: LightLinks | None = None,
+    times: int = 1,
 ) -> Geometry:
     """Meshes of gprims (one per gprim, with all its copies), instanced prototypes, and the materials that they use.
 
@@ -90,13 +91,14 @@ def build_meshes(
         metals: "diffuse" or "black".
         purposes: Purposes of material bindings, in order of preference.
         links: Light links, by which copies of a gprim may differ.
+        times: Number of shutter samples for which the gprims are read.
 
     Raises:
         InputError: There are more triangles than can be rendered.
     """
     table = MaterialTable(time, report, images, metals, purposes)
     shape_cache = {} if shapes is None else shapes
-    return _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(())).run(gprims)
+    return _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(())).run(gprims, times)
 
 
 class _MeshBuilder:
@@ -121,14 +123,14 @@ class _MeshBuilder:
         self._colored_levels: dict[tuple[int, Hashable], InstanceLevel] = {}
         self._instance_colored: dict[tuple[int, int], MaterialAssignment] = {}
 
-    def run(self, drawn_prims: Sequence[DrawnPrim]) -> Geometry:
+    def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
         self._table.resolve([drawn.prim for drawn in drawn_prims])
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
         meshes: list[Mesh] = []
         prototypes: dict[int, _Prototype] = {}
-        for stored in choose_storage(parts, self._report.source):
+        for stored in choose_storage(parts, self._report.source, times):
             gprim, group = gprims[stored.gprim], stored.prototype
             matrices_in_level = nested_transforms(level.matrices for level in stored.levels)
             colors = nested_colors((len(level.matrices), level.colors) for level in stored.levels)

@@ -28,22 +28,28 @@ def find_camera(stage: Usd.Stage, name: str | None, settings_camera: str, report
         The prim, or None if there is no camera.
 
     Raises:
-        InputError: There is no camera of that name.
+        InputError: There is no camera of that name, or there are several.
     """
     cameras = all_cameras(stage)
     if name is not None:
-        for prim in cameras:
-            if name in (str(prim.GetPath()), prim.GetName()):
-                return prim
+        named = [prim for prim in cameras if str(prim.GetPath()) == name]
+        named = named or [prim for prim in cameras if prim.GetName() == name]
+        if len(named) > 1:
+            paths = ", ".join(str(prim.GetPath()) for prim in named)
+            raise InputError(f"{report.source}: {len(named)} cameras are named '{name}': {paths}; give a path")
+        if named:
+            return named[0]
         available = ", ".join(str(prim.GetPath()) for prim in cameras) or "none"
         raise InputError(f"{report.source}: no camera '{name}'; available: {available}")
     if settings_camera:
         return stage.GetPrimAtPath(settings_camera)
     primary = UsdUtils.GetPrimaryCameraName()
-    chosen = next((prim for prim in cameras if prim.GetName() == primary), cameras[0] if cameras else None)
-    if chosen is not None and len(cameras) > 1 and chosen.GetName() != primary:
-        report.warn(chosen.GetPath(), f"rendered because it is the first of {len(cameras)} cameras")
-    return chosen
+    primaries = [prim for prim in cameras if prim.GetName() == primary]
+    candidates = primaries or cameras
+    if len(candidates) > 1:
+        which = f"cameras named {primary}" if primaries else "cameras"
+        report.warn(candidates[0].GetPath(), f"rendered because it is the first of {len(candidates)} {which}")
+    return candidates[0] if candidates else None
 
 
 def all_cameras(stage: Usd.Stage) -> list[Usd.Prim]:

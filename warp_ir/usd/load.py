@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 from pxr import Tf, Usd, UsdLux
 
-from warp_ir.scene import InputError, Light, LightKind, Scene
+from warp_ir.scene import InputError, Light, LightKind, Mesh, Scene
 from warp_ir.usd.assemble import Geometry, ShapeCache, build_meshes
 from warp_ir.usd.camera_prim import eye_camera, find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.diagnose import diagnose_black_picture, diagnose_dark_lights
+from warp_ir.usd.geometry.prototypes import reuse_prototypes
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.lights.light import LIGHTS, read_light
 from warp_ir.usd.linking import LightLinks, link_lights
@@ -60,7 +61,7 @@ _DEFAULT_DOME = Light("default dome", LightKind.DOME, (1.0, 1.0, 1.0))
 _SHUTTER_SAMPLES = 16
 """Shutter samples: scenes at the midpoints of equal parts of the shutter interval."""
 _MAX_SHUTTER_TRIANGLES = 20_000_000
-"""Maximum number of moving triangles, summed over shutter samples; beyond it there are fewer samples."""
+"""Maximum number of triangles that are stored anew for each shutter sample; beyond it there are fewer samples."""
 
 
 class StageOptions(TypedDict, total=False):
@@ -199,6 +200,9 @@ class StageReader:
         self._static: _StaticPart | None = None
         self._rigid_shapes: ShapeCache = {}
         self._moving_report = self._open_report.section()
+        self._times = 1  # for which moving gprims are read: 1, or the number of shutter samples
+        self._moving_triangles = 0  # stored anew at every time
+        self._prototypes: tuple[Mesh, ...] = ()  # of moving instances, at the last time
 
     def spec(self, time: float | str | None = None) -> RenderSpec:
         """The render settings of the stage, with all products.
@@ -235,11 +239,15 @@ class StageReader:
             camera_prim = (
                 None if self._eye is not None else find_camera(self.stage, self._camera, product.camera, report)
             )
-            scene = replace(self._scene(usd_time, camera_prim, spec, report), settings=dict(product.settings))
-            shutter: tuple[Scene, ...] = ()
+            interval = 0.0, 0.0
             blurs = self._motion_blur and product.settings.get("motion_blur", True) and not usd_time.IsDefault()
             if camera_prim is not None and blurs:
-                shutter = self._shutter_scenes(scene, usd_time.GetValue(), camera_prim, spec, report)
+                interval = read_shutter(camera_prim, usd_time, report)
+            self._times = _SHUTTER_SAMPLES if interval[1] > interval[0] else 1
+            scene = replace(self._scene(usd_time, camera_prim, spec, report), settings=dict(product.settings))
+            shutter: tuple[Scene, ...] = ()
+            if camera_prim is not None and self._times > 1:
+                shutter = self._shutter_scenes(usd_time.GetValue(), interval, camera_prim, spec, report)
             return replace(scene, warnings=report.lines(), shutter=shutter)
 
     @contextmanager
@@ -258,18 +266,16 @@ class StageReader:
         return 0 if self._static is None else len(self._static.moving.gprims)
 
     def _shutter_scenes(
-        self, scene: Scene, time: float, camera: Usd.Prim, spec: RenderSpec, report: Report
+        self, time: float, interval: tuple[float, float], camera: Usd.Prim, spec: RenderSpec, report: Report
     ) -> tuple[Scene, ...]:
-        """The scene at the midpoints of equal parts of the shutter interval; () if nothing moves or it is empty."""
-        opens, closes = read_shutter(camera, Usd.TimeCode(time), report)
+        """The scene at the midpoints of equal parts of the shutter interval; () if nothing moves."""
         assert self._static is not None
+        opens, closes = interval
         deforms = bool(self._static.moving.gprims) or self._time_varying.layout_varies
-        if closes <= opens or not (deforms or self._static.moving.lights or self._time_varying.varies(camera)):
+        if not (deforms or self._static.moving.lights or self._time_varying.varies(camera)):
             return ()
-        # Static geometry is stored once for all shutter samples.
-        moving = scene.triangle_count - sum(len(mesh.triangles) for mesh in self._static.geometry.meshes)
         count = _SHUTTER_SAMPLES
-        while count > 2 and count * moving > _MAX_SHUTTER_TRIANGLES:
+        while count > 2 and count * self._moving_triangles > _MAX_SHUTTER_TRIANGLES:
             count //= 2
         if count < _SHUTTER_SAMPLES:
             what = f"motion blur uses {count} shutter samples, not {_SHUTTER_SAMPLES}: the moving geometry is large"
@@ -289,6 +295,7 @@ class StageReader:
             static = self._static = self._read_static(time, key)
         geometry, lights = static.geometry, static.lights
         report.include(static.report)
+        self._moving_triangles = 0
         if static.moving.gprims or static.moving.lights:
             moving_report = self._open_report.section()
             geometry = self._with_moving_gprims(static, time, moving_report)
@@ -362,12 +369,15 @@ class StageReader:
     def _with_moving_gprims(self, static: "_StaticPart", time: Usd.TimeCode, report: Report) -> Geometry:
         """Static geometry, and that of varying gprims at a time.
 
-        Shapes of gprims that move rigidly are cached; deforming ones are read anew.
+        Shapes of gprims that move rigidly are cached, and large ones are stored once for all shutter samples, as
+        prototypes; deforming ones are read anew.
         """
         deforming = [self._time_varying.deforms(drawn.prim) for drawn in static.moving.gprims]
         geometry = static.geometry
         for shape_cache, deforms in ((self._rigid_shapes, False), ({}, True)):
             gprims = [drawn for drawn, d in zip(static.moving.gprims, deforming, strict=True) if d == deforms]
+            if self._times > 1 and not deforms:
+                gprims = [drawn.as_instance() if drawn.level.instance_count == 1 else drawn for drawn in gprims]
             if gprims:
                 added = build_meshes(
                     gprims,
@@ -379,9 +389,14 @@ class StageReader:
                     self._metals,
                     self._time_varying.purposes,
                     static.links,
+                    self._times,
                 )
+                rigid = set() if deforms else {k for group in added.instances for k in group.meshes}
+                self._moving_triangles += sum(len(m.triangles) for k, m in enumerate(added.meshes) if k not in rigid)
                 geometry = _merged(geometry, added)
-        return geometry
+        moving_instances = geometry.instances[len(static.geometry.instances) :]
+        meshes, self._prototypes = reuse_prototypes(geometry.meshes, moving_instances, self._prototypes)
+        return replace(geometry, meshes=meshes)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,12 @@ class DrawnPrim:
         """world_from_prim of every instance, float64 [k, 4, 4]."""
         return self.level.world_matrices() @ self.level_from_prim
 
+    def as_instance(self) -> "DrawnPrim":
+        """The same prim as the only instance in a level of its own, which may be stored as a prototype."""
+        path = (self.prim.GetPrimInPrototype() if self.prim.IsInstanceProxy() else self.prim).GetPath()
+        level = InstanceLevel(path, self.level, self.level_from_prim[None])
+        return replace(self, level=level, level_from_prim=np.eye(4))
+
 
 @dataclass(eq=False)
 class DrawnPrims:
@@ -66,6 +72,16 @@ class _PendingPrim:
     level_from_prim: Floats
     purpose: object | None
     instancers: tuple[Sdf.Path, ...]
+    origin: "_Origin"
+
+
+@dataclass(frozen=True, eq=False)
+class _Origin:
+    """What a prim that resets its transform stack is a child of: the world, or an instance of a point instancer."""
+
+    level: InstanceLevel
+    prototype: Usd.Prim | None = None
+    """The prototype of the innermost point instancer around the prim; None: the prim is in none."""
 
 
 def traverse_stage(
@@ -109,7 +125,7 @@ class _Traversal:
 
     def run(self) -> DrawnPrims:
         """Traverses the stage from its pseudo-root."""
-        root = _PendingPrim(self._stage.GetPseudoRoot(), _WORLD, np.eye(4), None, ())
+        root = _PendingPrim(self._stage.GetPseudoRoot(), _WORLD, np.eye(4), None, (), _Origin(_WORLD))
         stack = [root]
         while stack:  # an explicit stack: hierarchies may be deeper than Python's recursion limit
             stack += reversed(self._visit(stack.pop()))
@@ -132,7 +148,7 @@ class _Traversal:
                 return []
             info = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
             own_purpose, purpose = info.purpose, info
-            level, level_from_prim = self._transformed(prim, level, level_from_prim)
+            level, level_from_prim = self._transformed(prim, level, level_from_prim, pending.origin)
         if prim.IsInstance():
             report.stats["native_instances"] += 1
             level, level_from_prim = (
@@ -178,12 +194,15 @@ class _Traversal:
             default_index = read.raw(prim.GetAttribute("lod:default:index"), self._time)
             valid = isinstance(default_index, int) and 0 <= default_index < len(children)
             children = children[default_index if valid else 0 :][:1]
-        return [_PendingPrim(child, level, level_from_prim, purpose, pending.instancers) for child in children]
+        inherited = purpose, pending.instancers, pending.origin
+        return [_PendingPrim(child, level, level_from_prim, *inherited) for child in children]
 
-    def _transformed(self, prim: Usd.Prim, level: InstanceLevel, parent: Floats) -> tuple[InstanceLevel, Floats]:
+    def _transformed(
+        self, prim: Usd.Prim, level: InstanceLevel, parent: Floats, origin: _Origin
+    ) -> tuple[InstanceLevel, Floats]:
         """The level of a prim and its transform level_from_prim [4, 4], given those of its parent.
 
-        `!resetXformStack!` makes the prim a child of the world.
+        `!resetXformStack!` makes the prim a child of `origin`.
         """
         try:
             transform, resets = self._transforms.GetLocalTransformation(prim)
@@ -195,8 +214,29 @@ class _Traversal:
             self._report.warn(prim.GetPath(), "its transform is NaN or infinite; the identity is used")
             return level, parent
         if resets:
-            return _WORLD, matrix
+            return origin.level, self._level_from_world(origin.prototype, prim) @ matrix
         return level, parent if transform == _IDENTITY else parent @ matrix
+
+    def _level_from_world(self, prototype: Usd.Prim | None, prim: Usd.Prim) -> Floats:
+        """The transform [4, 4] from the world to the instances of a prototype, for a prim that resets its stack.
+
+        As in `UsdGeom.BBoxCache`, instances move prims relative to the prototype's parent in the stage; they ignore
+        that parent if the prototype resets its stack itself.
+        """
+        if prototype is None or prototype == prim:
+            return np.eye(4)
+        try:
+            if self._transforms.GetLocalTransformation(prototype)[1]:
+                return np.eye(4)
+            world_from_parent = np.array(self._transforms.GetParentToWorldTransform(prototype)).T
+            parent_from_world: Floats = np.linalg.inv(world_from_parent)
+            if np.isfinite(parent_from_world).all():
+                return parent_from_world
+        except (Tf.ErrorException, np.linalg.LinAlgError):
+            pass
+        what = f"it resets its transform stack, but that of {prototype.GetParent().GetPath()} cannot be inverted"
+        self._report.warn(prim.GetPath(), f"{what}: it is placed in the instances as in the world")
+        return np.eye(4)
 
     def _is_drawn(self, prim: Usd.Prim, purpose: str) -> bool:
         """Whether the purpose is included, VisibilityAPI does not hide it, and the render pass contains the prim."""
@@ -285,5 +325,6 @@ class _Traversal:
             # Ancestors of a prototype contribute neither transform nor visibility, only an inheritable purpose.
             own = UsdGeom.Imageable(prototype).ComputePurposeInfo() if prototype.IsA(UsdGeom.Imageable) else None
             inherited = own if own is not None and own.isInheritable else purpose
-            children.append(_PendingPrim(prototype, inner, np.eye(4), inherited, (*pending.instancers, path)))
+            instancers, origin = (*pending.instancers, path), _Origin(inner, prototype)
+            children.append(_PendingPrim(prototype, inner, np.eye(4), inherited, instancers, origin))
         return children

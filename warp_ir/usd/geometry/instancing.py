@@ -8,7 +8,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from warp_ir.scene import Bools, Floats, Ints
-from warp_ir.usd.geometry.velocities import extrapolated_points, extrapolated_rotation
+from warp_ir.usd.geometry.velocities import Motion, motion_after_sample
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
@@ -84,6 +84,8 @@ class InstancePrimvars:
     selected: Ints
     """Indices of the instances of this prototype, int [k]."""
     time: Usd.TimeCode
+    sampled: bool
+    """Whether values are those of the time sample before `time`, because instances move by velocities."""
 
     def has(self, name: str) -> bool:
         """Whether the instancer has a value for a primvar."""
@@ -102,12 +104,13 @@ class InstancePrimvars:
         if single and self.prototype.HasPrefix(self.prim.GetPath()):
             return None
         count = 1 if single else self.count
+        time = _at(primvar.GetAttr(), self.time, self.sampled and not single)
         try:
             if channels == 1:
-                scalars = read.scalars(primvar.GetAttr(), self.time)
+                scalars = read.scalars(primvar.GetAttr(), time)
                 values = None if scalars is None else scalars[:, None]
             else:
-                values = read.floats(primvar.GetAttr(), self.time, channels)
+                values = read.floats(primvar.GetAttr(), time, channels)
             indices = read.ints(primvar.GetIndicesAttr(), self.time) if primvar.IsIndexed() else None
         except Unreadable as error:
             report.warn(self.prim.GetPath(), f"{error}; {name} ignored")
@@ -153,28 +156,11 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[P
     """
     instancer = UsdGeom.PointInstancer(prim)
     indices = read.ints(instancer.GetProtoIndicesAttr(), time)
-    motion = instancer.GetPositionsAttr(), instancer.GetVelocitiesAttr(), instancer.GetAccelerationsAttr()
-    positions = extrapolated_points(*motion, time, report)
     prototypes = instancer.GetPrototypesRel().GetForwardedTargets()
     if indices is None or len(indices) == 0:
         return []
-    if positions is None or len(positions) != len(indices):
-        given = 0 if positions is None else len(positions)
-        raise Unreadable(f"it has {len(indices)} protoIndices but {given} positions")
     count = len(indices)
-    scales = _per_instance(instancer.GetScalesAttr(), time, 3, count, prim, report)
-    matrices = np.tile(np.eye(4), (count, 1, 1))
-    for attribute in (instancer.GetOrientationsfAttr(), instancer.GetOrientationsAttr()):
-        angular = instancer.GetAngularVelocitiesAttr()
-        sample_time, rotation = extrapolated_rotation(attribute, angular, time, count, report)
-        quaternions = _per_instance(attribute, sample_time, 4, count, prim, report)
-        if quaternions is not None:
-            orientation = _quaternion_matrices(quaternions)
-            matrices[:, :3, :3] = orientation if rotation is None else _axis_angle_matrices(rotation) @ orientation
-            break
-    if scales is not None:
-        matrices[:, :3, :3] *= scales[:, None, :]
-    matrices[:, :3, 3] = positions
+    matrices, sampled = _instance_matrices(instancer, count, time, report)
     visible = _visible_mask(instancer, count, time, report)
     finite = np.isfinite(matrices).all(axis=(1, 2))
     if not finite.all():
@@ -185,17 +171,71 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[P
     visible &= finite & valid
     opacity = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayOpacity")
     if opacity and opacity.GetInterpolation() not in (UsdGeom.Tokens.constant, UsdGeom.Tokens.uniform):
-        if np.any(np.asarray(read.raw(opacity.GetAttr(), time)) != 1.0):
+        if np.any(np.asarray(read.raw(opacity.GetAttr(), _at(opacity.GetAttr(), time, sampled))) != 1.0):
             report.warn(prim.GetPath(), "displayOpacity per instance is not supported: instances are opaque")
     groups = []
     for number, path in enumerate(prototypes):
         selected = np.flatnonzero(visible & (indices == number)).astype(np.int32)
         if len(selected):
-            primvars = InstancePrimvars(prim, path, count, selected, time)
+            primvars = InstancePrimvars(prim, path, count, selected, time, sampled)
             colors = primvars.read("displayColor", 3, report)
             colors = None if colors is None else colors.clip(0.0, 1.0)
             groups.append(PrototypeInstances(path, matrices[selected], colors, primvars))
     return groups
+
+
+def _at(attribute: Usd.Attribute, time: Usd.TimeCode, sampled: bool) -> Usd.TimeCode:
+    """The time at which a value per instance is read: that of the sample before if instances move by velocities."""
+    return read.sample_before(attribute, time) if sampled else time
+
+
+def _instance_matrices(
+    instancer: UsdGeom.PointInstancer, count: int, time: Usd.TimeCode, report: Report
+) -> tuple[Floats, bool]:
+    """Transforms of the instances, float64 [count, 4, 4], and whether values per instance are those of a sample.
+
+    As in USD, nothing is interpolated if velocities or angular velocities apply: an index may be that of another
+    instance in the next sample.
+
+    Raises:
+        Unreadable: There is not one position per instance.
+    """
+    prim, attribute = instancer.GetPrim(), instancer.GetPositionsAttr()
+    rates = instancer.GetVelocitiesAttr(), instancer.GetAccelerationsAttr()
+    motion = motion_after_sample(attribute, 3, *rates, time, report)
+    turning, orientations = _orientations(instancer, count, time, report)
+    sampled = motion is not None or turning is not None
+    if motion is None:
+        positions = read.floats(attribute, _at(attribute, time, sampled), 3)
+    else:
+        positions = motion.start + motion.change
+    if positions is None or len(positions) != count:
+        raise Unreadable(f"it has {count} protoIndices but {0 if positions is None else len(positions)} positions")
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    if orientations is not None:
+        start = _per_instance(orientations, _at(orientations, time, sampled), 4, count, prim, report)
+        if start is not None:
+            matrices[:, :3, :3] = _quaternion_matrices(start)
+    if turning is not None:
+        matrices[:, :3, :3] = _axis_angle_matrices(np.radians(turning.change)) @ matrices[:, :3, :3]
+    attribute = instancer.GetScalesAttr()
+    scales = _per_instance(attribute, _at(attribute, time, sampled), 3, count, prim, report)
+    if scales is not None:
+        matrices[:, :3, :3] *= scales[:, None, :]
+    matrices[:, :3, 3] = positions
+    return matrices, sampled
+
+
+def _orientations(
+    instancer: UsdGeom.PointInstancer, count: int, time: Usd.TimeCode, report: Report
+) -> tuple[Motion | None, Usd.Attribute | None]:
+    """What turns the instances since a sample of their orientations, and the attribute that holds these."""
+    for attribute in (instancer.GetOrientationsfAttr(), instancer.GetOrientationsAttr()):
+        if _per_instance(attribute, time, 4, count, instancer.GetPrim(), report) is not None:
+            rates = instancer.GetAngularVelocitiesAttr(), None
+            turning = motion_after_sample(attribute, 4, *rates, time, report)
+            return turning if turning is not None and len(turning.start) == count else None, attribute
+    return None, None
 
 
 def _per_instance(

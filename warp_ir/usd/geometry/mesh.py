@@ -10,10 +10,10 @@ from warp_ir.usd.geometry.refine import Scheme
 from warp_ir.usd.geometry.skinning import DeformedMesh, Skinning
 from warp_ir.usd.geometry.subdivision import read_subdivided
 from warp_ir.usd.geometry.triangulate import triangulate
-from warp_ir.usd.geometry.velocities import extrapolated_points
+from warp_ir.usd.geometry.velocities import motion_after_sample
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.triangles import TriangleMesh, count_elements, drop_degenerate, with_normals
+from warp_ir.usd.values.triangles import Cells, TriangleMesh, count_elements, drop_degenerate, with_normals
 
 
 def read_mesh(
@@ -33,7 +33,7 @@ def read_mesh(
         InputError: Subdivision would create too many triangles.
     """
     mesh = UsdGeom.Mesh(prim)
-    points = extrapolated_points(*_motion_attributes(mesh), time, report)
+    points, sampled = _points(mesh, time, report)
     counts = read.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = read.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
@@ -54,7 +54,8 @@ def read_mesh(
     scheme = read.text(mesh.GetSubdivisionSchemeAttr(), time, "catmullClark")
     if scheme != UsdGeom.Tokens.none:
         if levels and scheme in (supported.value for supported in Scheme):
-            return read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+            refined = read_subdivided(mesh, points, counts, indices, finite, keep, levels, time, report)
+            return replace(refined, sampled=True) if refined is not None and sampled else refined
         report.warn(
             prim.GetPath(), "subdivision surface rendered as its cage; a higher complexity refines it ({n} in all)"
         )
@@ -67,6 +68,7 @@ def read_mesh(
         face=face,
         corner=corner,
         element_counts=count_elements(points, counts, indices),
+        sampled=sampled,
     )
     return _finish(prim, shape, int(keep.sum()), time, report, deformed)
 
@@ -78,12 +80,12 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points = extrapolated_points(*_motion_attributes(tets), time, report)
+    points, sampled = _points(tets, time, report)
     faces = read.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
-    if points is not None and (faces is None or len(faces) == 0):
-        cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
-        if cells is not None and len(cells):
-            read.check_range(cells, len(points), "tetVertexIndices")
+    cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
+    if points is not None and cells is not None:
+        read.check_range(cells, len(points), "tetVertexIndices")
+        if (faces is None or len(faces) == 0) and len(cells):
             faces = np.asarray(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, time), dtype=np.int64).reshape(-1, 3)
     if points is None or faces is None or len(faces) == 0:
         return None
@@ -93,16 +95,45 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
     corner, face = triangulate(points, counts, faces.reshape(-1), keep)
     if read.text(tets.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
         corner = corner[:, ::-1]
-    element_counts = count_elements(points, counts, faces.reshape(-1))
     shape = TriangleMesh(
-        points, faces.reshape(-1).astype(np.int32)[corner], face, corner, element_counts=element_counts
+        *(points, faces.reshape(-1).astype(np.int32)[corner], face, corner),
+        element_counts=count_elements(points, counts, faces.reshape(-1)),
+        sampled=sampled,
+        cells=None if cells is None or not _has_values_per_cell(prim) else Cells(len(cells), _cells_of(faces, cells)),
     )
     return _finish(prim, shape, int(keep.sum()), time, report)
 
 
-def _motion_attributes(prim: UsdGeom.PointBased) -> tuple[Usd.Attribute, Usd.Attribute, Usd.Attribute]:
-    """The points, velocities and accelerations of a point-based prim."""
-    return prim.GetPointsAttr(), prim.GetVelocitiesAttr(), prim.GetAccelerationsAttr()
+def _has_values_per_cell(prim: Usd.Prim) -> bool:
+    """Whether a TetMesh has anything that refers to its tetrahedra: a uniform primvar, or a GeomSubset of them."""
+    normals = UsdGeom.PointBased(prim).GetNormalsInterpolation()
+    interpolations = [primvar.GetInterpolation() for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars()]
+    predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+    return UsdGeom.Tokens.uniform in (normals, *interpolations) or any(
+        child.IsA(UsdGeom.Subset) for child in prim.GetFilteredChildren(predicate)
+    )
+
+
+def _cells_of(faces: Ints, cells: Ints) -> Ints:
+    """For each triangle [f, 3] the first tetrahedron [t, 4] that it is a face of, int [f]; -1: of none."""
+    on_surface = np.zeros(int(max(faces.max(), cells.max(initial=0))) + 1, dtype=bool)
+    on_surface[faces] = True
+    sides = np.sort(cells, axis=1)[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    candidates = np.flatnonzero(on_surface[sides].all(axis=1))
+    rows = np.concatenate([sides[candidates], np.sort(faces, axis=1)])
+    first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)[1:]
+    found = first[inverse.reshape(-1)[len(candidates) :]]
+    padded = np.concatenate([candidates // 4, np.full(len(faces), -1)])
+    return padded[found]
+
+
+def _points(prim: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> tuple[Floats | None, bool]:
+    """The points [n, 3] of a prim, and whether they are moved by velocities (`TriangleMesh.sampled`)."""
+    attribute = prim.GetPointsAttr()
+    motion = motion_after_sample(attribute, 3, prim.GetVelocitiesAttr(), prim.GetAccelerationsAttr(), time, report)
+    if motion is None:
+        return read.floats(attribute, time, 3), False
+    return motion.start + motion.change, True
 
 
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
@@ -154,7 +185,7 @@ def _with_normals(
         based = UsdGeom.PointBased(prim)
         attribute, interpolation, indices = based.GetNormalsAttr(), based.GetNormalsInterpolation(), None
     try:
-        values = read.floats(attribute, time, 3)
+        values = read.floats(attribute, read.sample_before(attribute, time) if shape.sampled else time, 3)
         if values is None or len(values) == 0 or len(shape.triangles) == 0:
             return shape
         normals = primvar.expand(shape, values, interpolation, indices)

@@ -1,21 +1,22 @@
 """Whether a prototype is stored once or flattened into world space; memory decides.
 
 Rays through a single BVH are fastest, so small prototypes are flattened: those with one instance, and the others in
-ascending order of their triangles in the world, up to `MAX_FLATTENED_TRIANGLES` in total. Within a prototype that has
-several instances itself, nested instances are flattened if their triangles, of `_TRIANGLE_BYTES` each, take less memory
-than instances of `_INSTANCE_BYTES` each. All other prototypes are stored once.
+ascending order of their triangles in the world, up to `MAX_FLATTENED_TRIANGLES` in total. What moves while the shutter
+is open is flattened for each shutter sample, and counts as often. Within a prototype that has several instances itself,
+nested instances are flattened if their triangles, of `_TRIANGLE_BYTES` each, take less memory than instances of
+`_INSTANCE_BYTES` each. All other prototypes are stored once.
 """
 
 import hashlib
 import math
 import os
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.scene import Bools, Floats, InputError
+from warp_ir.scene import Bools, Floats, InputError, Instances, Mesh
 from warp_ir.scene.instances import cofactors
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 
@@ -100,12 +101,13 @@ class StoredMesh:
     """Levels whose instances are flattened into the mesh, outermost first."""
 
 
-def choose_storage(gprims: Sequence[InstancedGprim], source: str) -> list[StoredMesh]:
+def choose_storage(gprims: Sequence[InstancedGprim], source: str, times: int = 1) -> list[StoredMesh]:
     """Decides for every gprim whether its instances are flattened or its prototype is stored once.
 
     Args:
         gprims: In the order of the stage.
         source: Path of the file, named in errors.
+        times: Number of shutter samples for which the gprims are read.
 
     Returns:
         The meshes to store: one for each gprim, except for those in levels that another level represents.
@@ -114,7 +116,7 @@ def choose_storage(gprims: Sequence[InstancedGprim], source: str) -> list[Stored
         InputError: The scene has too many triangles or instances, even with prototypes stored once.
     """
     tree = _LevelTree(gprims)
-    tree.decide()
+    tree.decide(times)
     meshes, triangles, instances = [], 0, {}
     for k, gprim in enumerate(gprims):
         prototype, level = (None, None) if gprim.emissive else tree.storage_of(gprim.level)
@@ -170,8 +172,8 @@ class _LevelTree:
             group, level = group.parent, level.parent
         return (group, level) if group.stored else (None, None)
 
-    def decide(self) -> None:
-        """Chooses which groups are flattened and which are stored once."""
+    def decide(self, times: int) -> None:
+        """Chooses which groups are flattened and which are stored once; `times` as in `choose_storage`."""
         sizes: dict[int, int] = {}
         for group in reversed(self._groups):  # children before their parents
             size = sum(self._gprims[k].triangles for k in group.gprims if not self._gprims[k].emissive)
@@ -180,10 +182,11 @@ class _LevelTree:
             if group.parent is not None and group.parent.world_count > 1:
                 stored = _TRIANGLE_BYTES * size + _INSTANCE_BYTES * group.world_count
                 group.flattened = _TRIANGLE_BYTES * size * group.instance_count <= stored
-        candidates = [g for g in self._groups if not g.flattened and g.world_count > 1 and sizes[id(g)]]
+        below_world = [g for g in self._groups if g.parent is not None]
+        candidates = [g for g in below_world if not g.flattened and times * g.world_count > 1 and sizes[id(g)]]
         flattened_triangles = 0
         for group in sorted(candidates, key=lambda g: g.world_count * sizes[id(g)]):
-            flattened_triangles += group.world_count * sizes[id(group)]
+            flattened_triangles += times * group.world_count * sizes[id(group)]
             group.stored = flattened_triangles > MAX_FLATTENED_TRIANGLES
 
     def _grouped(self, parent: LevelGroup | None, siblings: Sequence[InstanceLevel]) -> list[LevelGroup]:
@@ -230,6 +233,43 @@ class _LevelTree:
                 tuple(children),
             )
         return self._signatures[id(level)]
+
+
+def reuse_prototypes(
+    meshes: Sequence[Mesh], instances: Sequence[Instances], previous: Sequence[Mesh]
+) -> tuple[tuple[Mesh, ...], tuple[Mesh, ...]]:
+    """Replaces prototypes by equal meshes of another time, so that they are stored once for both.
+
+    Args:
+        meshes: The meshes of a scene.
+        instances: Which of them are prototypes.
+        previous: Prototypes of another time.
+
+    Returns:
+        The meshes, and the prototypes among them.
+    """
+    known: dict[str, list[Mesh]] = {}
+    for mesh in previous:
+        known.setdefault(mesh.name, []).append(mesh)
+    reused = list(meshes)
+    prototypes = sorted({k for group in instances for k in group.meshes})
+    for k in prototypes:
+        reused[k] = next((mesh for mesh in known.get(reused[k].name, ()) if _same_mesh(mesh, reused[k])), reused[k])
+    return tuple(reused), tuple(reused[k] for k in prototypes)
+
+
+def _same_mesh(one: Mesh, other: Mesh) -> bool:
+    """Whether two meshes are equal in all fields."""
+    return one is other or all(_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Mesh))
+
+
+def _equal(one: object, other: object) -> bool:
+    """Whether two fields of meshes are equal: arrays, arrays by name, or other values."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_equal(one[name], other[name]) for name in one)
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return one is other or (one.dtype == other.dtype and np.array_equal(one, other))
+    return one is other or (not isinstance(one, np.ndarray) and not isinstance(other, np.ndarray) and one == other)
 
 
 def digest(array: npt.NDArray[np.generic] | None) -> bytes | None:

@@ -1,8 +1,10 @@
-"""Extrapolation by authored velocities: points, positions and orientations between time samples.
+"""Motion by authored velocities: points, positions and orientations between time samples.
 
-Where topology changes from sample to sample, values cannot be interpolated; velocities then give the motion after a
-sample (UsdGeomPointBased and UsdGeomPointInstancer).
+What is in an array may change places from sample to sample, so values cannot be interpolated; velocities then give the
+motion after a sample (UsdGeomPointBased and UsdGeomPointInstancer), and the other arrays are those of a sample as well.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from pxr import Usd
@@ -12,63 +14,56 @@ from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
 
-def extrapolated_points(
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Values of a time sample, and their change since then by velocities."""
+
+    start: Floats
+    """Values of the sample, float64 [n, c]."""
+    change: Floats
+    """v t + a t² / 2, float64 [n, 3], t seconds after the sample."""
+
+
+def motion_after_sample(
     attribute: Usd.Attribute,
+    columns: int,
     velocities: Usd.Attribute,
-    accelerations: Usd.Attribute,
+    accelerations: Usd.Attribute | None,
     time: Usd.TimeCode,
     report: Report,
-) -> Floats | None:
-    """Points or positions [n, 3] at a time: p + v t + a t² / 2 from the sample before, else interpolated by USD."""
-    points = read.floats(attribute, time, 3)
-    seconds = _seconds_since_sample(attribute, velocities, time)
-    if points is None or seconds == 0.0:
-        return points
-    sample = _bracketing_samples(attribute, time)
-    assert sample is not None
-    try:
-        start = read.floats(attribute, Usd.TimeCode(sample[0]), 3)
-        if start is None:
-            return points
-        velocity = _rates(velocities, sample[0], len(start))
-        if _bracketing_samples(accelerations, time) == sample:
-            velocity = velocity + 0.5 * seconds * _rates(accelerations, sample[0], len(start))
-    except Unreadable as error:
-        report.warn(attribute.GetPrim().GetPath(), f"{error}; the points are interpolated instead")
-        return points
-    extrapolated: Floats = start + seconds * velocity
-    return extrapolated
+) -> Motion | None:
+    """The motion of an array's elements since the time sample before a time; None if velocities do not apply.
 
+    As in USD, they apply only if the time is between the same samples of both, and if they have a value per element.
 
-def extrapolated_rotation(
-    attribute: Usd.Attribute, rates: Usd.Attribute, time: Usd.TimeCode, count: int, report: Report
-) -> tuple[Usd.TimeCode, Floats | None]:
-    """The time at which orientations are to be read, and the rotations that follow them.
+    Args:
+        attribute: Points, positions or orientations.
+        columns: Numbers of each element.
+        velocities: Rates of change per second; angularVelocities are in degrees per second.
+        accelerations: Rates of change of the velocities, or None.
+        time: Time of the values.
+        report: Receives a warning if the velocities do not fit the array.
 
-    Returns:
-        The time of the sample before and rotation vectors [count, 3] in radians; `time` itself and None if angular
-        velocities do not apply.
+    Raises:
+        Unreadable: The array is of another type.
     """
-    seconds = _seconds_since_sample(attribute, rates, time)
-    if seconds == 0.0:
-        return time, None
-    sample = _bracketing_samples(attribute, time)
-    assert sample is not None
-    try:
-        return Usd.TimeCode(sample[0]), np.radians(_rates(rates, sample[0], count)) * seconds
-    except Unreadable as error:
-        report.warn(attribute.GetPrim().GetPath(), f"{error}; the orientations are interpolated instead")
-        return time, None
-
-
-def _seconds_since_sample(attribute: Usd.Attribute, velocities: Usd.Attribute, time: Usd.TimeCode) -> float:
-    """Seconds since the time sample before a time; 0 if velocities do not apply."""
     if time.IsDefault() or not velocities or not velocities.HasAuthoredValue():
-        return 0.0
-    sample = _bracketing_samples(attribute, time)
-    if sample is None or _bracketing_samples(velocities, time) != sample:
-        return 0.0
-    return float((time.GetValue() - sample[0]) / attribute.GetPrim().GetStage().GetTimeCodesPerSecond())
+        return None
+    samples = read.bracketing_samples(attribute, time)
+    if samples is None or read.bracketing_samples(velocities, time) != samples:
+        return None
+    start = read.floats(attribute, Usd.TimeCode(samples[0]), columns)
+    if start is None:
+        return None
+    seconds = (time.GetValue() - samples[0]) / attribute.GetPrim().GetStage().GetTimeCodesPerSecond()
+    try:
+        velocity = _rates(velocities, samples[0], len(start))
+        if accelerations is not None and read.bracketing_samples(accelerations, time) == samples:
+            velocity = velocity + 0.5 * seconds * _rates(accelerations, samples[0], len(start))
+    except Unreadable as error:
+        report.warn(attribute.GetPrim().GetPath(), f"{error}; the {attribute.GetName()} are interpolated instead")
+        return None
+    return Motion(start, seconds * velocity)
 
 
 def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
@@ -83,12 +78,3 @@ def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:
     if not np.isfinite(rates).all():
         raise Unreadable(f"{attribute.GetName()} has values that are NaN or infinite")
     return rates
-
-
-def _bracketing_samples(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
-    """The times of the samples before and after a time; None without samples.
-
-    As in USD, velocities apply to points only if the bracketing samples of both are the same.
-    """
-    samples = attribute.GetBracketingTimeSamples(time.GetValue()) if attribute else ()
-    return (samples[0], samples[1]) if samples else None

@@ -51,16 +51,20 @@ def find_render_pass(stage: Usd.Stage, name: str | None, report: Report) -> Rend
     """The pass of this path or name; None: no name is given.
 
     Raises:
-        InputError: There is no pass of that name.
+        InputError: There is no pass of that name, or there are several.
     """
     if name is None:
         return None
     passes = [prim for prim in stage.Traverse() if prim.IsA(UsdRender.Pass)]
-    chosen = next((prim for prim in passes if name in (str(prim.GetPath()), prim.GetName())), None)
-    if chosen is None:
+    named = [prim for prim in passes if str(prim.GetPath()) == name]
+    named = named or [prim for prim in passes if prim.GetName() == name]
+    if len(named) > 1:
+        paths = ", ".join(str(prim.GetPath()) for prim in named)
+        raise InputError(f"{report.source}: {len(named)} render passes are named '{name}': {paths}; give a path")
+    if not named:
         paths = ", ".join(str(prim.GetPath()) for prim in passes) or "none"
         raise InputError(f"{report.source}: no render pass '{name}'; available: {paths}")
-    return RenderPass(chosen, report)
+    return RenderPass(named[0], report)
 
 
 def includes(query: Usd.UsdCollectionMembershipQuery, path: Sdf.Path) -> bool:

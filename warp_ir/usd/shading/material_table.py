@@ -20,6 +20,8 @@ TRANSPARENT = -1
 """Instead of a material index: opacity is 0, so the triangle is dropped."""
 UNBOUND = -2
 """Instead of a material index: no readable material is bound, so displayColor applies."""
+_TETRAHEDRON = "tetrahedron"
+"""Element type of GeomSubsets of a TetMesh's tetrahedra."""
 _MAX_VARIANTS = 2**16
 """Maximum number of materials that the primvars of one prim create; beyond it, the mean is used."""
 
@@ -284,11 +286,15 @@ class MaterialTable:
                 continue
             if faces is None:
                 continue
-            valid = (faces >= 0) & (faces < count)
+            of_cells = shape.cells if UsdGeom.Subset(subset).GetElementTypeAttr().Get() == _TETRAHEDRON else None
+            valid = (faces >= 0) & (faces < (count if of_cells is None else of_cells.count))
             if not valid.all():
                 self._report.warn(subset.GetPath(), "{n} face indices out of range ignored", int((~valid).sum()))
-            mask = np.zeros(count, dtype=bool)
-            mask[faces[valid]] = True
+            if of_cells is None:
+                mask = np.zeros(count, dtype=bool)
+                mask[faces[valid]] = True
+            else:
+                mask = np.isin(of_cells.of_face, faces[valid])
             if (mask & assigned).any():
                 self._report.warn(
                     subset.GetPath(), "{n} faces are already in another subset", int((mask & assigned).sum())
@@ -324,8 +330,13 @@ def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:
         for child in children
         if child.IsA(UsdGeom.Subset)
         and UsdGeom.Subset(child).GetFamilyNameAttr().Get() == UsdShade.Tokens.materialBind
-        and UsdGeom.Subset(child).GetElementTypeAttr().Get() == UsdGeom.Tokens.face
+        and UsdGeom.Subset(child).GetElementTypeAttr().Get() in _element_types(prim)
     ]
+
+
+def _element_types(prim: Usd.Prim) -> tuple[str, ...]:
+    """The elements of a prim to which materials are bound."""
+    return (UsdGeom.Tokens.face, _TETRAHEDRON) if prim.IsA(UsdGeom.TetMesh) else (UsdGeom.Tokens.face,)
 
 
 def _dangling_target(prim: Usd.Prim) -> Sdf.Path | None:

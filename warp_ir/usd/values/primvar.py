@@ -27,6 +27,12 @@ def expand(mesh: TriangleMesh, values: Floats, interpolation: str, indices: Ints
         if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
             raise Unreadable(f"an index of the primvar is out of range of its {len(values)} values")
     count = len(values) if indices is None else len(indices)
+    element = mesh.face
+    if mesh.cells is not None and interpolation == UsdGeom.Tokens.uniform and count == mesh.cells.count:
+        element = mesh.cells.of_face[mesh.face]
+        count = len(mesh.cells.of_face)
+        if element.min(initial=0) < 0:
+            raise Unreadable("a surface face is not that of a tetrahedron")
     expected = 1 if interpolation == UsdGeom.Tokens.constant else mesh.element_counts.get(interpolation)
     if expected is None:
         raise Unreadable(f"its interpolation {interpolation} is not defined for this prim")
@@ -39,7 +45,7 @@ def expand(mesh: TriangleMesh, values: Floats, interpolation: str, indices: Ints
     if interpolation == UsdGeom.Tokens.constant:
         return np.broadcast_to(values[0], (*mesh.triangles.shape, values.shape[1]))
     if interpolation == UsdGeom.Tokens.uniform:
-        return np.broadcast_to(values[mesh.face][:, None], (*mesh.triangles.shape, values.shape[1]))
+        return np.broadcast_to(values[element][:, None], (*mesh.triangles.shape, values.shape[1]))
     if interpolation == UsdGeom.Tokens.faceVarying:
         return values[mesh.corner]
     if mesh.refiner is not None:
@@ -60,7 +66,7 @@ def corner_values(
     if not primvar or not primvar.HasValue():
         return None
     try:
-        values = _value_rows(primvar.GetAttr(), time, channels)
+        values = _value_rows(primvar.GetAttr(), _time_of(primvar, mesh, time), channels)
         if values is None or len(values) == 0:
             return None
         if channels >= 3 and read.is_color(primvar.GetAttr()):
@@ -82,6 +88,13 @@ def corner_values(
         first: Floats = corners[0, 0] if len(corners) else values[0]
         return first
     return corners
+
+
+def _time_of(primvar: UsdGeom.Primvar, mesh: TriangleMesh, time: Usd.TimeCode) -> Usd.TimeCode:
+    """The time at which the values of a primvar are read: that of a sample if they belong to elements that are."""
+    if not (mesh.sampled and primvar) or primvar.GetInterpolation() == UsdGeom.Tokens.constant:
+        return time
+    return read.sample_before(primvar.GetAttr(), time)
 
 
 def _value_rows(attribute: Usd.Attribute, time: Usd.TimeCode, channels: int) -> Floats | None:
@@ -110,7 +123,8 @@ def display_opacity(prim: Usd.Prim, mesh: TriangleMesh, time: Usd.TimeCode, repo
 
     Varying opacity is averaged over each triangle and rounded to multiples of 1/255, to limit the number of materials.
     """
-    authored = read.raw(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity").GetAttr(), time)
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
+    authored = read.raw(primvar.GetAttr(), _time_of(primvar, mesh, time))
     if np.all(np.asarray(1.0 if authored is None else authored) == 1.0):
         return np.ones(1)
     corners = corner_values(prim, mesh, "displayOpacity", 1, time, report)
@@ -141,8 +155,9 @@ def texture_coordinates(
         used = primvar.GetPrimvarName()
         report.warn(prim.GetPath(), f"no primvar '{name}' for texture coordinates: '{used}' is used instead")
     try:
-        size = np.shape(np.asarray(read.raw(primvar.GetAttr(), time)))[-1:]
-        values = read.floats(primvar.GetAttr(), time, 3 if size == (3,) else 2)
+        values_time = _time_of(primvar, mesh, time)
+        size = np.shape(np.asarray(read.raw(primvar.GetAttr(), values_time)))[-1:]
+        values = read.floats(primvar.GetAttr(), values_time, 3 if size == (3,) else 2)
         indices = read.ints(primvar.GetIndicesAttr(), time) if primvar.IsIndexed() else None
         if values is None or len(values) == 0:
             raise Unreadable(f"{name} is empty")

@@ -21,6 +21,25 @@ def raw(attribute: Usd.Attribute, time: Usd.TimeCode) -> object:
         return None
 
 
+def bracketing_samples(attribute: Usd.Attribute, time: Usd.TimeCode) -> tuple[float, float] | None:
+    """The times of the last sample until a time and of the next one after it; None without samples.
+
+    Both are that of the first sample before it, and that of the last sample after it.
+    """
+    if time.IsDefault() or not attribute:
+        return None
+    samples = attribute.GetBracketingTimeSamples(time.GetValue())
+    if samples and samples[0] == samples[1]:
+        return samples[0], attribute.GetBracketingTimeSamples(time.GetValue() + Usd.TimeCode.SafeStep())[1]
+    return (samples[0], samples[1]) if samples else None
+
+
+def sample_before(attribute: Usd.Attribute, time: Usd.TimeCode) -> Usd.TimeCode:
+    """The time of the last sample until a time, or else of the first one; the time itself without samples."""
+    samples = bracketing_samples(attribute, time)
+    return time if samples is None else Usd.TimeCode(samples[0])
+
+
 def floats(attribute: Usd.Attribute, time: Usd.TimeCode, columns: int) -> Floats | None:
     """An array of vectors, float64 [n, columns]; None if it has no value.
 

@@ -23,6 +23,15 @@ class PrimvarRefiner(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """The tetrahedra of a TetMesh."""
+
+    count: int
+    of_face: Ints
+    """int [f], the tetrahedron that each surface face belongs to; -1: none."""
+
+
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """Triangles of a gprim that know the face and the face-vertices of the prim that they were made of.
 
@@ -46,6 +55,10 @@ class TriangleMesh:
     """Number of faces without area that were dropped."""
     refiner: PrimvarRefiner | None = None
     """Interpolates primvars over a subdivided surface; None: the surface is not subdivided."""
+    sampled: bool = False
+    """Whether velocities move its points after a time sample: values per element are then those of a sample as well."""
+    cells: Cells | None = None
+    """What uniform values of a TetMesh belong to; None: they belong to faces."""
 
     def keep(self, mask: Bools) -> "TriangleMesh":
         """This mesh with only the triangles that the mask [m] selects."""
