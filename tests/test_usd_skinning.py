@@ -225,6 +225,14 @@ def test_refined_surfaces_are_posed_before_they_are_refined(tmp_path):
     assert turned.points == pytest.approx(np.stack([1 - y, x - 1, z], axis=1), abs=1e-6)
 
 
+def test_cages_are_smooth_in_their_pose(tmp_path):
+    """The normals of a cage are computed from the posed points: at the bend they halve the right angle."""
+    smooth = load(tmp_path, strip().replace('"none"', '"catmullClark"'), time=10.0).meshes[0]
+    assert smooth.points == pytest.approx(TURNED, abs=1e-6)
+    bend = smooth.normals[(smooth.triangles == 2) | (smooth.triangles == 3)]
+    assert bend == pytest.approx(np.tile(np.array([-1, 1, 0]) / np.sqrt(2), (len(bend), 1)), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("parts", "word"),
     [
