@@ -274,6 +274,9 @@ def test_the_process_ends_in_order(stage, code):
         (["render", ROOM, "a.png", "--max-bounces", "-1"], "--max-bounces: must be a whole number"),
         (["render", ROOM, "a.png", "--aov", "beauty"], "unknown 'beauty'; known are direct, indirect"),
         (["render", ROOM, "a.png", "--exposure", "nan"], "not a number: 'nan'"),
+        (["render", ROOM, "a.png", "--exposure", "-inf"], "not a number: '-inf'"),
+        (["render", ROOM, "a.png", "--width", "-1e3"], "--width/-w: invalid int value: '-1e3'"),
+        *((["render", ROOM, "a.##.png", "--frames", f], "is not understood") for f in ("-2:", "1:", ":2", "1:2x", "")),
         (["render", ROOM, "a.png", "--device", "cuda:77"], "--device: 'cuda:77' is not available; available: cpu"),
         (["render", ROOM, "a.png", "--device", ""], "--device: '' is not available"),
         (["render", ROOM, "a.png", "--frames", "1:3"], "the output needs one placeholder"),
@@ -624,6 +627,25 @@ def test_aovs_in_every_order(words):
     assert (args.stage, args.output, args.aovs) == ("a", "b", ["depth", "normal"])
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--frames", "-2:0"], "frames", "-2:0"),
+        (["-f", "-4:-2x2,-.5"], "frames", "-4:-2x2,-.5"),
+        (["--eye", "-1e-7", "-.5E3", "-5."], "eye", [-1e-7, -500.0, -5.0]),
+        (["--eye", "0", "0", "1", "--look-at", "-1e1", "0", "-1_0"], "look_at", [-10.0, 0.0, -10.0]),
+        (["--exposure", "-1e0"], "exposure", -1.0),
+        (["--time", "-1e0"], "time", -1.0),
+        (["--data-window", "-1e-1", "0", "1", "1"], "data_window", [-0.1, 0.0, 1.0, 1.0]),
+    ],
+)
+def test_negative_numbers_are_values(words, name, value):
+    """A word that begins like a negative number is one, however it is written: no flag begins so."""
+    for order in (["a", "b", *words], [*words, "a", "b"]):
+        args = parse(["render", *order])
+        assert getattr(args, name) == value and (args.stage, args.output) == ("a", "b")
+
+
 def test_help_names_every_aov(capsys):
     """The AOVs need not be guessed."""
     with pytest.raises(SystemExit):
@@ -645,6 +667,8 @@ def test_placeholders():
     assert list(outputs_of("###.##.png", "1:2x0.5", None).values()) == [
         Path(f"00{x}.png") for x in ("1.00", "1.50", "2.00")
     ]
+    assert list(outputs_of("a.###.png", "-2:0", None).values()) == [Path(f"a.{x}.png") for x in ("-02", "-01", "000")]
+    assert outputs_of("a.###.png", "-0", None) == {0: Path("a.000.png")}
     assert outputs_of("#/a.png", "1000", None) == {1000: Path("1000/a.png")}
     assert outputs_of("a#.png", None, 3.0) == {3.0: Path("a#.png")}
     with pytest.raises(InputError):

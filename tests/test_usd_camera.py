@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.stages import load, warned
+from tests.stages import load, mesh_text, warned
 from warp_ir import InputError, Projection
 
 
@@ -196,10 +196,66 @@ def Cube "C" {{
         assert y == pytest.approx(scene.camera.window[3])
 
 
-def test_a_tiny_scene_is_framed_from_beyond_the_near_plane(tmp_path):
-    """As in usdrecord, the camera steps back by 1 where it would stand closer than its near plane."""
-    distance = load(tmp_path, 'def Cube "C" { double size = 0.01\n}').camera.world_from_camera[2, 3]
-    assert distance == pytest.approx(1 + 0.01 * math.sqrt(0.5) / (0.5 * 20.955 / 50) + 0.005)
+def framed_quad(scene):
+    """Corners of the only quadrilateral in the picture, [4, 2] from -1 to 1, and the fraction of it that it covers."""
+    corners = np.pad(scene.meshes[0].points, ((0, 0), (0, 1)), constant_values=1.0)
+    for group in scene.instances:
+        corners = corners @ group.matrices[0].T
+    x, y, z, _ = np.linalg.inv(scene.camera.world_from_camera) @ corners.T
+    assert (z < 0.0).all()
+    x, y = -x / z / scene.camera.window[1], -y / z / scene.camera.window[3]
+    doubled = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+    return np.stack([x, y], axis=1), abs(doubled) / 8.0
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.01, 1.0, 1e9])
+@pytest.mark.parametrize("axis", ["Y", "Z"])
+def test_the_size_of_a_scene_does_not_matter(tmp_path, axis, size):
+    """There is no near plane to step back from: a cube fills the same part of the picture at every size."""
+    scene = load(tmp_path, f'(upAxis = "{axis}")\ndef Cube "C" {{ double size = {size}\n}}')
+    distance = size * (math.sqrt(0.5) / (0.5 * 20.955 / 50) + 0.5)
+    at = np.abs(scene.camera.world_from_camera[:3, 3])
+    assert at == pytest.approx([0, distance, 0] if axis == "Z" else [0, 0, distance])
+
+
+@pytest.mark.parametrize("instanced", [False, True])
+@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 90.0, 120.0])
+@pytest.mark.parametrize("axis", ["Y", "Z"])
+def test_what_is_edge_on_is_framed_from_elsewhere(tmp_path, axis, angle, instanced):
+    """A square that holds the line of sight, however it is turned about it, is whole in the picture, and well seen.
+
+    At 45 degrees to the view at least |cos 45| sin 45 = 1/2 of its area is seen.
+    """
+    side = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+    corners = [(*(u * side), w) for u, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [(x, -z, y) if axis == "Z" else (x, y, z) for x, y, z in corners]
+    text = mesh_text(corners, [4], range(4), name="P")
+    if instanced:
+        copies = [f'def Xform "I{k}" (instanceable = true\n references = </A>) {{\n}}\n' for k in range(2)]
+        text = f'class Xform "A" {{{text}\n}}\n' + "".join(copies)
+    scene = load(tmp_path, f'(upAxis = "{axis}")\n{text}')
+    corners, fraction = framed_quad(scene)
+    assert np.abs(corners).max() <= 1.0 + 1e-6 and fraction > 0.1
+    assert warned(scene, "no camera", f"{'-Z' if axis == 'Y' else '+Y'} and ")
+
+
+@pytest.mark.parametrize(
+    ("size", "turned"),
+    [
+        *(((1, 0.02, 1), False), ((1, 0.002, 1), True), ((0.002, 1, 1), True), ((1, 1, 1e-4), False)),
+        *(((1, 1e-4, 1e-4), False), ((1e-4, 1, 1e-4), False), ((1e-4, 1e-4, 1), False)),
+    ],
+)
+def test_only_what_is_hardly_seen_is_framed_from_elsewhere(tmp_path, size, turned):
+    """A plate of 2 % of its width is seen as in usdrecord, one of 0.2 % from above; a rod is thin from anywhere."""
+    scene = load(tmp_path, f"""
+def Cube "C" {{
+    double size = 1
+    double3 xformOp:scale = {size}
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+}}""")  # fmt: skip
+    assert warned(scene, "no camera", "-Z and") == turned
+    assert np.allclose(scene.camera.world_from_camera[:3, :3], np.eye(3)) != turned
 
 
 def test_two_cameras_of_one_name_are_an_error(tmp_path):

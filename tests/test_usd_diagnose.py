@@ -7,7 +7,7 @@ from tests.stages import SCENES, load, need_real_files
 from warp_ir import InputError, Scene, load_usd
 from warp_ir.cli import main
 
-WORDS = ("the camera is inside", "all geometry", "it emits nothing", "sees no geometry")
+WORDS = ("the camera is inside", "all geometry", "it emits nothing", "sees no geometry", "picture is black")
 
 
 def said(scene: Scene) -> list[str]:
@@ -106,6 +106,33 @@ def test_a_picture_without_geometry_says_so(tmp_path, capsys):
     file.write_text("#usda 1.0\n" + ball(radius=0.1) + aside)
     assert main(["render", str(file), str(tmp_path / "a.npy"), *small]) == 0
     assert "sees no geometry" not in capsys.readouterr().err
+
+
+ROOM = """
+def Cube "Room" { }
+def SphereLight "L" { float inputs:radius = 0.1
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["--eye", "-3", "0", "0"], "eye: no light reaches what the camera sees"),
+        (["--eye", "-1", "0.1", "0.2", "--look-at", "0", "0", "0"], "eye: the camera lies in a surface"),
+        (["--eye", "0.5", "0.2", "0.1", "--mask", "/Room", "--default-light", "none"], "eye: no light reaches"),
+        (["--eye", "0.5", "0.2", "0.1"], ""),
+        (["--eye", "-3", "0", "0", "--mask", "/Room"], ""),
+    ],
+)
+def test_black_pictures_say_so(tmp_path, capsys, flags, word):
+    """From outside a closed room, in its wall, without light: it is said, and no error claimed; others say nothing."""
+    file, picture = tmp_path / "a.usda", tmp_path / "a.npy"
+    file.write_text("#usda 1.0\n" + ROOM)
+    assert main(["render", str(file), str(picture), "--width", "8", "--iterations", "4", *flags]) == 0
+    out, err = capsys.readouterr()
+    assert (word in err) and ("picture is black" in err) == bool(word)
+    assert ("estimated error" in out) == (np.load(picture)[..., :3].max() > 0.0) == (not word)
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.usda")), ids=lambda p: p.stem)

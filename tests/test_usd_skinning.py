@@ -144,6 +144,56 @@ def test_blend_shapes_move_normals(tmp_path):
     assert mesh.normals[moved] == pytest.approx(np.tile(expected, (moved.sum(), 1)), abs=1e-6)
 
 
+@pytest.mark.parametrize("method", ["classicLinear", "dualQuaternion"])
+@pytest.mark.parametrize(
+    ("joints", "indices"),
+    [
+        (["a/b", "a"], [1, 1, 1, 1, 0, 0]),
+        (["a/b", "none", "a"], [2, 2, 2, 2, 0, 0]),
+        (["none", "a/b"], [0, 0, 0, 0, 1, 1]),
+    ],
+)
+def test_a_mesh_can_number_the_joints_itself(tmp_path, joints, indices, method):
+    """Indices refer to the mesh's skel:joints: in another order, fewer, or with one that the skeleton lacks (identity).
+
+    USD's own skinning is the referee; the order of the joints in the skeleton must not matter.
+    """
+    order = f"uniform token[] skel:joints = {joints}".replace("'", '"')
+    order += f'\n uniform token primvars:skel:skinningMethod = "{method}"'
+    text = strip(mesh=order, indices=f'{indices} (elementSize = 1\n interpolation = "vertex")')
+    scene = load(tmp_path, text, time=10.0)
+    assert scene.meshes[0].points == pytest.approx(TURNED, abs=1e-6) and not warned(scene, "rest pose")
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usda"))
+    cache, root = UsdSkel.Cache(), UsdSkel.Root(stage.GetPrimAtPath("/Root"))
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    prim = stage.GetPrimAtPath("/Root/M")
+    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Root/Skel")))
+    points = UsdGeom.Mesh(prim).GetPointsAttr().Get()
+    transforms = skeleton.ComputeSkinningTransforms(10.0)
+    assert cache.GetSkinningQuery(prim).ComputeSkinnedPoints(transforms, points, 10.0)
+    assert scene.meshes[0].points == pytest.approx(np.array(points, dtype=float), abs=1e-6)
+
+
+@pytest.mark.parametrize(("joints", "indices"), [([], [0] * 6), (["a/b"], [0, 0, 0, 0, 1, 1])])
+def test_indices_beyond_the_joints_of_the_mesh(tmp_path, joints, indices):
+    """The mesh's own list of joints is the one that an index must be in."""
+    order = f"uniform token[] skel:joints = {joints}".replace("'", '"')
+    text = strip(mesh=order, indices=f'{indices} (elementSize = 1\n interpolation = "vertex")')
+    scene = load(tmp_path, text, time=10.0)
+    assert warned(scene, "/Root/M", "rest pose")
+    assert scene.meshes[0].points == pytest.approx(REST)
+
+
+def test_a_mesh_and_an_animation_can_order_blend_shapes_differently(tmp_path):
+    """Weights go to the shapes of their names; a shape that the animation does not name stays at 0."""
+    two = BLEND.replace('["up"]', '["other", "up"]').replace("</Root/M/Up>", "[</Root/M/Other>, </Root/M/Up>]")
+    other = 'def BlendShape "Other" {\n uniform vector3f[] offsets = [(9, 9, 9)]\n uniform int[] pointIndices = [3]\n}'
+    expected = TURNED.copy()
+    expected[:2, 1] += 4.0
+    scene = load(tmp_path, strip(mesh=f"{two}\n{other}", weight=1), time=10.0)
+    assert scene.meshes[0].points == pytest.approx(expected, abs=1e-6)
+
+
 def test_instances_share_a_pose_unless_their_animations_differ(tmp_path):
     """A rig inside a prototype is posed once; with an animation above each instance, each has its own pose."""
     rig = strip(animation="").replace('def SkelRoot "Root" {', 'over "Root" {\ndef SkelRoot "Rig" {') + "\n}"
@@ -173,6 +223,14 @@ def test_refined_surfaces_are_posed_before_they_are_refined(tmp_path):
     still, turned = (load(tmp_path, text, time=t, complexity="high").meshes[0] for t in (0.0, 10.0))
     x, y, z = still.points.T
     assert turned.points == pytest.approx(np.stack([1 - y, x - 1, z], axis=1), abs=1e-6)
+
+
+def test_cages_are_smooth_in_their_pose(tmp_path):
+    """The normals of a cage are computed from the posed points: at the bend they halve the right angle."""
+    smooth = load(tmp_path, strip().replace('"none"', '"catmullClark"'), time=10.0).meshes[0]
+    assert smooth.points == pytest.approx(TURNED, abs=1e-6)
+    bend = smooth.normals[(smooth.triangles == 2) | (smooth.triangles == 3)]
+    assert bend == pytest.approx(np.tile(np.array([-1, 1, 0]) / np.sqrt(2), (len(bend), 1)), abs=1e-6)
 
 
 @pytest.mark.parametrize(

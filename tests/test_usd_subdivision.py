@@ -206,6 +206,59 @@ def test_normals_are_smooth_but_not_across_creases(tmp_path):
     assert lid.normals[~top][..., 2].max() < 0.5
 
 
+@pytest.mark.parametrize("more", ["normal3f[] normals", "normal3f[] primvars:normals"])
+@pytest.mark.parametrize("scheme", ["catmullClark", "loop", "bilinear"])
+def test_authored_normals_are_for_polygons_only(tmp_path, scheme, more):
+    """UsdGeomMesh: with a scheme other than none, normals are ignored; on a flat square the face's own remain."""
+    tilted = f'{more} = {[(0, 1, 0)] * 4} (interpolation = "vertex")'
+    text = scheme_text(SQUARE, [[0, 1, 2], [0, 2, 3]], tilted, scheme)
+    assert load(tmp_path, text).meshes[0].normals is None
+    # The same normals are used on polygons.
+    polygons = load(tmp_path, text.replace(f'"{scheme}"', '"none"')).meshes[0]
+    assert polygons.normals == pytest.approx(np.broadcast_to([0.0, 1.0, 0.0], (2, 3, 3)))
+
+
+@pytest.mark.parametrize("left_handed", [False, True])
+def test_cages_have_the_smooth_normals_of_storm(tmp_path, left_handed):
+    """Sums of the corners' cross products at each point: on a cube its diagonals, creased or not, of any size.
+
+    Bilinear cages and polygons are faceted.
+    """
+    more = """int[] creaseIndices = [1, 5, 7, 3, 1]
+    int[] creaseLengths = [5]
+    float[] creaseSharpnesses = [10]"""
+    more += '\n    uniform token orientation = "leftHanded"' if left_handed else ""
+    side = -1.0 if left_handed else 1.0
+    for size in (1e-6, 1.0):
+        mesh = load(tmp_path, scheme_text(size * CUBE, CUBE_FACES, more)).meshes[0]
+        expected = side * CUBE[mesh.triangles] / np.sqrt(3.0)
+        assert mesh.normals == pytest.approx(expected, abs=1e-6) and len(mesh.points) == 8
+    for scheme in ("bilinear", "none"):
+        assert load(tmp_path, scheme_text(CUBE, CUBE_FACES, more, scheme)).meshes[0].normals is None
+
+
+def test_normals_of_a_loop_cage_are_weighted_by_area(tmp_path):
+    """At the tip of a slanted tetrahedron the normal is the sum of its three area vectors, each doubled."""
+    points = np.array([(0, 0, 0), (3, 0, 0), (0, 2, 0), (0.5, 0.25, 1.0)])
+    faces = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    mesh = load(tmp_path, scheme_text(points, faces, scheme="loop")).meshes[0]
+    tip = sum(np.cross(points[b] - points[a], points[c] - points[a]) for a, b, c in faces[1:])
+    found = mesh.normals[mesh.triangles == 3]
+    assert found == pytest.approx(np.tile(tip / np.linalg.norm(tip), (3, 1)), abs=1e-6)
+
+
+def test_flat_cages_stay_flat(tmp_path):
+    """Concave faces, empty ones, holes and faces at points that are not finite turn no normal of a plane."""
+    points = [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0), (np.nan, 5, 3)]
+    text = mesh_text(points, [6, 0, 3], [0, 1, 2, 3, 4, 5, 3, 4, 6]).replace('"none"', '"catmullClark"')
+    mesh = load(tmp_path, text).meshes[0]
+    assert area(mesh) == pytest.approx(3.0) and mesh.normals is None
+    # A hole is not drawn, but the surface goes on through it: the rim keeps the normals of the cube.
+    open_cube = load(tmp_path, scheme_text(CUBE, CUBE_FACES, "int[] holeIndices = [0]")).meshes[0]
+    assert area(open_cube) == pytest.approx(20.0)
+    assert open_cube.normals == pytest.approx(CUBE[open_cube.triangles] / np.sqrt(3.0), abs=1e-6)
+
+
 def test_left_handed_surfaces_are_turned_around(tmp_path):
     """The same faces read the other way round: volume and normals change sign."""
     text = scheme_text(CUBE, CUBE_FACES)

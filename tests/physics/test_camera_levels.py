@@ -263,3 +263,17 @@ def test_a_subdivided_square(tmp_path):
         stage = text.replace(plain, f'uniform token subdivisionScheme = "{scheme}"')
         found, _ = picture(tmp_path, stage, options=dict(complexity="veryhigh"))
         assert_level(found, 2.0 * expected * 0.25 / 3.0)
+
+
+@pytest.mark.parametrize("scheme", ["catmullClark", "bilinear"])
+def test_normals_of_a_subdivided_square_do_not_tilt_it(tmp_path, scheme):
+    """UsdGeomMesh ignores normals with a scheme: under a white sky a flat square of albedo ½ shows ½ everywhere.
+
+    Along the square they would show half the sky. The albedo is all: the sky is uniform, and nothing hides it.
+    """
+    more = f"""normal3f[] normals = {[(0, 1, 0)] * 4} (interpolation = "vertex")
+    color3f[] primvars:displayColor = [(0.5, 0.5, 0.5)]"""
+    points = [(-5, -5, -5), (5, -5, -5), (5, 5, -5), (-5, 5, -5)]
+    text = camera() + mesh("Square", points, more=more).replace('"none"', f'"{scheme}"') + light("DomeLight")
+    found, _ = picture(tmp_path, text, options=dict(warnings=("cage",)))
+    assert_level(found, 0.5)

@@ -6,6 +6,7 @@ The flags for `RenderSettings` are generated from its fields: a new field is a n
 import argparse
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -93,6 +94,11 @@ examples:
 
 class _Parser(argparse.ArgumentParser):
     """Raises errors as `InputError`: one line that names the help option."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # argparse takes -1 for a number, but -1e-7, -2:0 and -inf for flags; no flag begins so.
+        self._negative_number_matcher = re.compile(r"-(\.?\d|inf|nan)", re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")

@@ -9,6 +9,9 @@ from warp_ir.scene import InputError
 TimeCode = float | str | None
 """A time code; "default": the default time; None: the stage's start."""
 _MAX_FRAMES = 1_000_000
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_SPAN = re.compile(rf"{_NUMBER}(?::{_NUMBER}(?:x{_NUMBER})?)?")
+"""One frame or a range. USD's parser ends the process where a number is missing, as in `1:`."""
 
 
 def outputs_of(output: str, frames: str | None, time: TimeCode) -> dict[TimeCode, Path]:
@@ -49,14 +52,14 @@ def time_codes(spec: str) -> list[float]:
     codes: dict[float, None] = {}
     for part in spec.split(","):
         try:
-            span = UsdUtils.TimeCodeRange.CreateFromFrameSpec(part.strip())
-            valid = span.IsValid()
+            known = _SPAN.fullmatch(part.strip())
+            span = UsdUtils.TimeCodeRange.CreateFromFrameSpec(part.strip()) if known else None
         except Tf.ErrorException:
-            valid = False
-        if not valid:
+            span = None
+        if span is None or not span.IsValid():
             raise InputError(f"--frames: {part.strip()!r} is not understood; use 101, 101:105 or 101:109x2")
         for code in span:
-            codes[code.GetValue()] = None
+            codes[code.GetValue() + 0.0] = None  # -0 becomes 0
             if len(codes) > _MAX_FRAMES:
                 raise InputError(f"--frames: more than {_MAX_FRAMES} frames: {spec}")
     return list(codes)

@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     from warp_ir.usd import StageReader
     from warp_ir.usd.settings.render_spec import Product
 
+_EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
+"""Words of the warnings of a scene that explain a black picture."""
+_IN_SURFACE = 1e-6
+"""Depth in units of the scene's size below which a camera lies in the surface that it sees."""
+
 
 @dataclass(frozen=True)
 class _Picture:
@@ -206,9 +211,11 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
     elif args.checkpoint > 0.0 and checkpoint.write():
         say(f"{checkpoint.path}: --resume continues from this checkpoint")
     blank = _blank_picture(scene, film)
-    if blank and not args.quiet:
-        say_warnings(blank)
-    _summarize(job, path, film, bool(written))
+    explained = any(words in line for line in scene.warnings for words in _EXPLANATIONS)
+    blank_warnings = [f"{scene.camera.name}: {blank}"] if blank and not explained else []
+    if blank_warnings and not args.quiet:
+        say_warnings(blank_warnings)
+    _summarize(job, path, film, written=bool(written), blank=bool(blank))
     statistics = {
         "output": [str(file) for file in written],
         "frame": picture.time,
@@ -225,17 +232,27 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         "loaded": dict(scene.stats),
         "kept": reused,
         "counts": dict(film.counts),
-        "warnings": [*scene.warnings, *blank],
+        "warnings": [*scene.warnings, *blank_warnings],
     }
     return statistics, code
 
 
-def _blank_picture(scene: Scene, film: "Film") -> list[str]:
-    """The warning that a picture shows no geometry, unless a warning of the scene explains it already."""
-    explained = any("all geometry" in line or "draws no geometry" in line for line in scene.warnings)
-    if explained or not film.iterations or film.aov("alpha").max() > 0.0:
-        return []
-    return [f"{scene.camera.name}: the camera sees no geometry"]
+def _blank_picture(scene: Scene, film: "Film") -> str:
+    """Why a picture shows nothing: one sentence; "" if it shows something, or if there is no picture.
+
+    Camera rays begin in a surface if all depths are within the rounding of float32 coordinates.
+    """
+    if not film.iterations:
+        return ""
+    hit = film.aov("alpha") > 0.0
+    if not hit.any():
+        return "the camera sees no geometry"
+    if film.radiance().max() > 0.0:
+        return ""
+    size = max(scene.extent, float(abs(scene.camera.world_from_camera[:3, 3]).max()))
+    if hit.all() and film.aov("depth").max() <= _IN_SURFACE * size:
+        return "the camera lies in a surface: the picture is black"
+    return "no light reaches what the camera sees, from outside a closed room for example: the picture is black"
 
 
 def _count_reused(previous: Sequence[object], current: Sequence[object]) -> int:
@@ -251,14 +268,17 @@ def _aovs(args: argparse.Namespace, from_stage: Sequence[str], path: Path) -> tu
     return tuple(name for name in from_stage if name != "alpha")  # every .exr has alpha
 
 
-def _summarize(job: _Job, path: Path, film: "Film", written: bool) -> None:
-    """Prints the line about a finished picture, and warnings and hints about its values."""
+def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: bool) -> None:
+    """Prints the line about a finished picture, and warnings and hints about its values.
+
+    A blank picture says nothing about the light that its samples have missed: it has no estimated error.
+    """
     if film.interrupted:
         say("interrupted" if written else "interrupted before the first iteration: nothing written")
     if not written or job.args.quiet:
         return
     error = film.error()
-    estimate = f", estimated error {100.0 * error:.2g} %" if math.isfinite(error) else ""
+    estimate = f", estimated error {100.0 * error:.2g} %" if math.isfinite(error) and not blank else ""
     print(
         f"{path}: {film.width} x {film.height}, {film.iterations} iterations in {film.seconds:.2f} s"
         f" on {job.device}{estimate}",

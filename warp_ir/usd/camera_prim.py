@@ -2,17 +2,26 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils
 
-from warp_ir.scene import MAX_CLIPPING_PLANES, Camera, Floats, InputError, Projection
+from warp_ir.scene import MAX_CLIPPING_PLANES, Camera, Floats, InputError, Projection, Scene
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
 _APERTURE_UNIT = 0.1
 """Apertures and focal lengths are in tenths of a scene unit."""
+_LENS = Gf.Camera()
+"""USD's default lens."""
+_HALF_WINDOW = tuple(
+    0.5 * aperture / _LENS.focalLength for aperture in (_LENS.horizontalAperture, _LENS.verticalAperture)
+)
+"""Half the width and height of the picture at the unit distance, with the default lens."""
+_MIN_COVERAGE = 0.01
+"""Fraction of the picture; geometry that covers less from the usual direction is framed from another if that helps."""
+_COVERAGE_SAMPLES = 100_000
+"""Maximum number of triangles of a mesh, summed over its copies, from which its coverage is estimated."""
 
 
 def find_camera(stage: Usd.Stage, name: str | None, settings_camera: str, report: Report) -> Usd.Prim | None:
@@ -130,26 +139,51 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
     )
 
 
-def framing_camera(lower: Floats, upper: Floats, up_axis: str) -> Camera:
-    """The camera with which `usdrecord` frames a stage without one (its `_ComputeCameraToFrameStage`).
+def framing_camera(scene: Scene, up_axis: str) -> tuple[Camera, str]:
+    """A camera that shows the whole scene from outside, and the direction in which it looks.
 
-    usdrecord crops tall scenes above and below; this camera moves back until the whole scene is in the picture.
+    It is the one with which `usdrecord` frames a stage without a camera (its `_ComputeCameraToFrameStage`), along -Z or
+    +Y, but for three differences: it moves back until tall scenes are in the picture, it has no near plane to keep away
+    from, and it looks from above or from the side, at 45 degrees, at what would be seen edge-on: at geometry that
+    covers less than `_MIN_COVERAGE` of the picture, and much more of it from there.
 
     Args:
-        lower: Minimum corner of the scene's bounds, [3].
-        upper: Maximum corner, [3].
+        scene: The scene.
         up_axis: "Y": the camera looks along -Z; "Z": along +Y.
     """
-    default = Gf.Camera()
-    half_x = 0.5 * default.horizontalAperture / default.focalLength
-    half_y = 0.5 * default.verticalAperture / default.focalLength
-    size, matrix = upper - lower, np.eye(4)
-    width, height, depth = (size[0], size[1], size[2]) if up_axis == "Y" else (size[0], size[2], size[1])
-    distance = 0.5 * max(math.hypot(width, height) / half_x, height / half_y) + 0.5 * depth
-    if distance < default.clippingRange.min:
-        distance += 1.0
+    lower, upper = scene.bounds()
+    axis, s = "-Z" if up_axis == "Y" else "+Y", math.sqrt(0.5)
+    views = ((axis, (0.0, 0.0, 1.0)), (f"{axis} and down", (0.0, s, s)), (f"{axis} and to the left", (s, 0.0, s)))
+    camera = _framing(lower, upper, views[0][1], up_axis)
+    covered = _coverage(scene, camera, _MIN_COVERAGE)
+    if covered >= _MIN_COVERAGE or not scene.triangle_count:
+        return camera, axis
+    turned = [(_framing(lower, upper, back, up_axis), direction) for direction, back in views[1:]]
+    coverages = [_coverage(scene, camera, math.inf) for camera, _ in turned]
+    best = int(np.argmax(coverages))
+    return turned[best] if coverages[best] > 4.0 * covered else (camera, axis)
+
+
+def _framing(lower: Floats, upper: Floats, back: tuple[float, float, float], up_axis: str) -> Camera:
+    """The camera with USD's default lens that frames a box.
+
+    Args:
+        lower: Minimum corner of the box, [3].
+        upper: Maximum corner, [3].
+        back: Unit vector from the box to the camera; x is to the right, y up.
+        up_axis: "Y" or "Z".
+    """
+    half_x, half_y = _HALF_WINDOW
+    matrix = np.eye(4)
+    right = np.cross((0.0, 1.0, 0.0), back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
     if up_axis == "Z":
-        matrix[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+        axes = axes @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    # The box that is aligned with the camera around the box that is aligned with the axes.
+    width, height, depth = np.abs(axes) @ (upper - lower)
+    distance = 0.5 * max(math.hypot(width, height) / half_x, height / half_y) + 0.5 * depth
+    matrix[:3, :3] = axes.T
     matrix[:3, 3] = 0.5 * (lower + upper) + distance * matrix[:3, 2]
     return Camera("framing camera", matrix, (-half_x, half_x, -half_y, half_y))
 
@@ -160,9 +194,41 @@ def eye_camera(eye: Sequence[float], target: Sequence[float], up_axis: str) -> C
     Raises:
         InputError: The points coincide, or the direction between them is the up axis.
     """
-    lens_radius = framing_camera(np.zeros(3), np.ones(3), up_axis)
+    half_x, half_y = _HALF_WINDOW
     up = (0.0, 1.0, 0.0) if up_axis == "Y" else (0.0, 0.0, 1.0)
-    return replace(lens_radius, name="eye", world_from_camera=Camera.look_at(eye, target, up).world_from_camera)
+    matrix = Camera.look_at(eye, target, up).world_from_camera
+    return Camera("eye", matrix, (-half_x, half_x, -half_y, half_y))
+
+
+def _coverage(scene: Scene, camera: Camera, enough: float) -> float:
+    """Sum of the projected areas of a scene's triangles, as a fraction of the picture; the sum ends where it is enough.
+
+    Large meshes and many copies are estimated from every n-th triangle and copy.
+
+    Args:
+        scene: The scene, all of it before the camera.
+        camera: A perspective camera.
+        enough: A sum that need not be exceeded.
+    """
+    camera_from_world = np.linalg.inv(camera.world_from_camera)
+    left, right, bottom, top = camera.window
+    groups = {k: group.matrices for group in scene.instances for k in group.meshes}
+    total = 0.0
+    for k, mesh in enumerate(scene.meshes):
+        matrices = groups.get(k, np.eye(4)[None])
+        step = 1 + len(mesh.triangles) // _COVERAGE_SAMPLES
+        copies = 1 + len(matrices) * min(len(mesh.triangles), _COVERAGE_SAMPLES) // _COVERAGE_SAMPLES
+        corners = mesh.points[mesh.triangles[::step]]
+        for matrix in matrices[::copies]:
+            placed = camera_from_world @ matrix
+            x, y, z = np.moveaxis(corners @ placed[:3, :3].T + placed[:3, 3], 2, 0)
+            x, y = x / -z, y / -z
+            u, v = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1]
+            doubled = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+            total += 0.5 * float(doubled[np.isfinite(doubled)].sum()) * step * copies
+            if total >= enough * (right - left) * (top - bottom):
+                return enough
+    return total / ((right - left) * (top - bottom))
 
 
 def _rigid_transform(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Floats:

@@ -323,10 +323,9 @@ class StageReader:
             center = np.mean(scene.bounds(), axis=0).tolist()
             camera_record = eye_camera(self._eye, center if self._look_at is None else self._look_at, self._up_axis)
         elif camera_record is None:
+            camera_record, direction = framing_camera(scene, self._up_axis)
             if meshes:
-                direction = "-Z" if self._up_axis == "Y" else "+Y"
                 report.warn("/", f"no camera; one that looks along {direction} frames the scene from outside")
-            camera_record = framing_camera(*scene.bounds(), self._up_axis)
         scene = replace(scene, camera=camera_record, stats=_stats(scene, report))
         diagnose_black_picture(scene, report)
         return replace(scene, warnings=report.lines())

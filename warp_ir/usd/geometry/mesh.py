@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 from warp_ir.scene import Bools, Floats, Ints
 from warp_ir.usd.geometry.refine import Scheme
 from warp_ir.usd.geometry.skinning import DeformedMesh, Skinning
-from warp_ir.usd.geometry.subdivision import read_subdivided
+from warp_ir.usd.geometry.subdivision import cage_normals, read_subdivided
 from warp_ir.usd.geometry.triangulate import triangulate
 from warp_ir.usd.geometry.velocities import motion_after_sample
 from warp_ir.usd.values import primvar, read
@@ -60,7 +60,8 @@ def read_mesh(
             prim.GetPath(), "subdivision surface rendered as its cage; a higher complexity refines it ({n} in all)"
         )
     corner, face = triangulate(points, counts, indices, keep)
-    if read.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded:
+    left_handed = read.text(mesh.GetOrientationAttr(), time) == UsdGeom.Tokens.leftHanded
+    if left_handed:
         corner = corner[:, ::-1]
     shape = TriangleMesh(
         points=points,
@@ -70,7 +71,13 @@ def read_mesh(
         element_counts=count_elements(points, counts, indices),
         sampled=sampled,
     )
-    return _finish(prim, shape, int(keep.sum()), time, report, deformed)
+    shape = _drop_degenerate(shape, int(keep.sum()))
+    if scheme == UsdGeom.Tokens.none:
+        return _with_authored_normals(prim, shape, time, report, deformed)
+    if scheme == UsdGeom.Tokens.bilinear or len(shape.triangles) == 0:
+        return shape
+    normals = cage_normals(points, counts, indices, finite)[shape.triangles]
+    return with_normals(shape, -normals if left_handed else normals)
 
 
 def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> TriangleMesh | None:
@@ -101,7 +108,7 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
         sampled=sampled,
         cells=None if cells is None or not _has_values_per_cell(prim) else Cells(len(cells), _cells_of(faces, cells)),
     )
-    return _finish(prim, shape, int(keep.sum()), time, report)
+    return _with_authored_normals(prim, _drop_degenerate(shape, int(keep.sum())), time, report)
 
 
 def _has_values_per_cell(prim: Usd.Prim) -> bool:
@@ -159,22 +166,19 @@ def _finite_faces(prim: Usd.Prim, points: Floats, counts: Ints, indices: Ints, r
     return keep
 
 
-def _finish(
+def _drop_degenerate(shape: TriangleMesh, wanted: int) -> TriangleMesh:
+    """The shape without degenerate triangles; counts those of the `wanted` faces that vanished."""
+    shape = drop_degenerate(shape)
+    lost = wanted - int(np.count_nonzero(np.bincount(shape.face))) if len(shape.face) else wanted
+    return replace(shape, degenerate_faces=lost)
+
+
+def _with_authored_normals(
     prim: Usd.Prim,
     shape: TriangleMesh,
-    wanted: int,
     time: Usd.TimeCode,
     report: Report,
     deformed: DeformedMesh | None = None,
-) -> TriangleMesh:
-    """The shape without degenerate triangles and with normals; counts those of the `wanted` faces that vanished."""
-    shape = drop_degenerate(shape)
-    lost = wanted - int(np.count_nonzero(np.bincount(shape.face))) if len(shape.face) else wanted
-    return _with_normals(prim, replace(shape, degenerate_faces=lost), time, report, deformed)
-
-
-def _with_normals(
-    prim: Usd.Prim, shape: TriangleMesh, time: Usd.TimeCode, report: Report, deformed: DeformedMesh | None
 ) -> TriangleMesh:
     """The shape with its authored normals, deformed like its points; without normals it stays faceted."""
     authored = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")

@@ -131,14 +131,10 @@ class Refinement:
         Args:
             points: Refined points, float64 [points', 3].
         """
-        corners = points[self.indices]
-        edge = np.roll(corners, -1, axis=1) - corners
-        (x, y, z), (u, v, w) = np.moveaxis(edge, 2, 0), np.moveaxis(-np.roll(edge, 1, axis=1), 2, 0)
+        corner = points[self.indices.reshape(-1)]
+        products = corner_products(corner, self._finest.next, self._finest.previous)
         group = self._finest.smooth_groups()
-        products = (y * w - z * v, z * u - x * w, x * v - y * u)
-        total = np.stack([np.bincount(group, weights=product.reshape(-1)) for product in products], axis=1)
-        length = np.sqrt(np.einsum("ni,ni->n", total, total))[:, None]
-        return (total / np.where(length > 0.0, length, 1.0))[group]
+        return unit_sums(products, group, int(group.max(initial=-1)) + 1)[group]
 
     def _cut_along_seams(self, indices: Ints) -> tuple[Cage, Ints]:
         """The cage cut along the seams of face-varying values.
@@ -173,6 +169,25 @@ class Refinement:
                 dart = (siblings == 1) & boundary & ~mesh_boundary[point]
                 sharp = np.where((siblings == 2) & corner | dart, INFINITE, sharp)
         return replace(cut, point_sharpness=sharp, smooth_triangles=cage.smooth_triangles), first
+
+
+def corner_products(corner: Floats, following: Ints, previous: Ints) -> Floats:
+    """Cross products of the edges at face-vertices, to the next and to the previous one, float64 [3, v].
+
+    Args:
+        corner: Positions of the face-vertices, float64 [v, 3].
+        following: The next face-vertex of the same face, int [v].
+        previous: The face-vertex before it, int [v].
+    """
+    (x, y, z), (u, v, w) = (corner[following] - corner).T, (corner[previous] - corner).T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def unit_sums(vectors: Floats, group: Ints, count: int) -> Floats:
+    """Sums of the vectors [3, v] of each group [v], as unit vectors, float64 [count, 3]; 0 where they cancel out."""
+    total = np.stack([np.bincount(group, weights=row, minlength=count) for row in vectors], axis=1)
+    length = np.sqrt(np.einsum("ni,ni->n", total, total))[:, None]
+    return np.asarray(total / np.where(length > 0.0, length, 1.0))
 
 
 class _Topology:

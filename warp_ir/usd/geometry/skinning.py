@@ -174,7 +174,8 @@ class Skinning:
         joints = skeleton.ComputeSkinningTransforms(self._time)
         mapper = query.GetJointMapper()
         if joints and mapper is not None and not mapper.IsIdentity():
-            joints = mapper.RemapTransforms(joints)
+            # Joints of the mesh that the skeleton lacks become the identity, as in USD's own skinning.
+            joints = mapper.RemapTransforms(joints, Vt.Matrix4dArray())
         if not joints or not np.isfinite(np.asarray(joints)).all():
             raise Unreadable(f"its skeleton {skeleton.GetPrim().GetPath()} cannot be evaluated")
         influences = query.ComputeVaryingJointInfluences(len(points), self._time)

@@ -6,7 +6,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Bools, Floats, InputError, Ints
-from warp_ir.usd.geometry.refine import INFINITE, Cage, Refinement, Scheme
+from warp_ir.usd.geometry.refine import INFINITE, Cage, Refinement, Scheme, corner_products, unit_sums
 from warp_ir.usd.geometry.triangulate import triangulate
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
@@ -81,6 +81,37 @@ def read_subdivided(
     if scheme is Scheme.BILINEAR or len(shape.triangles) == 0:
         return shape
     return with_normals(shape, orientation * refinement.normals(refined_points)[shape.corner])
+
+
+def cage_normals(points: Floats, counts: Ints, indices: Ints, mask: Bools) -> Floats:
+    """Smooth normals of an unrefined surface at its points, unit or 0, float64 [n, 3], outward for right-handed faces.
+
+    Storm draws Catmull-Clark and Loop cages with them: sums over corners of the cross products of their two edges,
+    whatever the creases (`Hd_SmoothNormals`). At reflex corners, whose product points inwards, it is turned over.
+
+    Args:
+        points: float64 [n, 3].
+        counts: Vertices per face, int [f].
+        indices: Point of each face-vertex, in range.
+        mask: Mask [f] of the faces that count.
+    """
+    face = np.repeat(np.arange(len(counts)), counts)
+    following: Ints = np.arange(1, len(indices) + 1)
+    used = counts > 0
+    last = (np.cumsum(counts) - 1)[used]
+    following[last] = last + 1 - counts[used]
+    previous = np.empty_like(following)
+    previous[following] = np.arange(len(following))
+    corner = points[indices]
+    products = np.where(mask[face], corner_products(corner, following, previous), 0.0)
+    if (counts > 3).any():
+        first = following[last][np.cumsum(used)[face] - 1]
+        # Newell's method: twice the area of a face along its normal, relative to its first vertex for precision.
+        (x, y, z), (u, v, w) = (corner - corner[first]).T, (corner[following] - corner[first]).T
+        doubled = (y * w - z * v, z * u - x * w, x * v - y * u)
+        area = np.stack([np.bincount(face, weights=part, minlength=len(counts)) for part in doubled])
+        products = np.where(np.einsum("kv,kv->v", products, area[:, face]) < 0.0, -products, products)
+    return unit_sums(products, indices, len(points))
 
 
 def _cage(
