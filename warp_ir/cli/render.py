@@ -8,6 +8,7 @@ import platform
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -181,6 +182,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
     stop_signal = int(film.interrupted)
     code = 128 + (stop_signal if stop_signal > 1 else signal.SIGINT) if stop_signal else 0
     written: list[Path] = []
+    of_writing: list[str] = []
     if film.iterations or not stop_signal:
         begin = time.perf_counter()
         metadata: dict[str, object] = {
@@ -191,24 +193,27 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
-        for file, aovs in picture.files.items():
-            written += write_image(
-                file,
-                film,
-                aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
-                exposure=args.exposure,
-                tonemap=args.tonemap,
-                half=args.half,
-                metadata=metadata,
-            )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            for file, aovs in picture.files.items():
+                written += write_image(
+                    file,
+                    film,
+                    aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
+                    exposure=args.exposure,
+                    tonemap=args.tonemap,
+                    half=args.half,
+                    metadata=metadata,
+                )
+        of_writing = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
     if not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
         say(f"{checkpoint.path}: --resume continues from this checkpoint")
-    blank = _blank_picture(scene, film)
-    if blank and not args.quiet:
-        say_warnings(blank)
+    of_picture = [*_blank_picture(scene, film), *of_writing]
+    if not args.quiet:
+        say_warnings(of_picture)
     _summarize(job, path, film, bool(written))
     statistics = {
         "output": [str(file) for file in written],
@@ -226,7 +231,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         "loaded": dict(scene.stats),
         "kept": reused,
         "counts": dict(film.counts),
-        "warnings": [*scene.warnings, *blank],
+        "warnings": [*scene.warnings, *of_picture],
     }
     return statistics, code
 

@@ -5,6 +5,7 @@
 
 import os
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -99,7 +100,8 @@ def write_image(
         aov: Name of the film's AOV to write in place of its radiance.
         aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
             to a file of its own: picture.NAME.png for picture.png.
-        half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped.
+        half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped,
+            with a warning that counts their pixels.
         metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
         color_space: One of `COLOR_SPACES`, for colours in the linear formats; None: that of the film's settings, or
             linear Rec. 709 for an array.
@@ -314,6 +316,15 @@ def _write_exr(
         np.clip(plane, -_HALF_MAX, _HALF_MAX) if stored == oiio.HALF else plane
         for (plane, _), stored in zip(channels.values(), formats, strict=True)
     ]
+    beyond = [
+        np.abs(plane) > _HALF_MAX
+        for (plane, _), stored in zip(channels.values(), formats, strict=True)
+        if stored == oiio.HALF
+    ]
+    clipped = int(np.any(beyond, axis=0).sum()) if beyond else 0
+    if clipped:
+        what = f"{clipped} of {beyond[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
+        warnings.warn(f"{path}: {what}; 32 bits hold them (half=False, --float)", stacklevel=3)
     pixels = np.stack(planes, axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])
     spec.channelformats = tuple(formats)

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.scene import Color, Floats, Material, Wrap
+from warp_ir.scene import MAX_RADIANCE, Color, Floats, Material, Wrap
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, as_color, combine, constant
-from warp_ir.usd.lights.light import MAX_RADIANCE
 from warp_ir.usd.shading.network import ShadingNetwork
 from warp_ir.usd.shading.vendor_shaders import shader_name, vendor_reader
 from warp_ir.usd.values import read
