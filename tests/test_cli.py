@@ -61,6 +61,20 @@ def error_of(capsys, *args, code=2):
 # ---- render ----------------------------------------------------------------------------------------------
 
 
+def test_clipped_pixels_are_counted(tmp_path, capsys):
+    """Of an .exr with 16 bits; one with 32 bits clips nothing. The statistics hold the warning."""
+    stage = tmp_path / "a.usda"
+    stage.write_text(DARK % "1e9")
+    flags = ["--width", "8", "--iterations", "2", "--light-paths", "16", "--stats", str(tmp_path / "s.json")]
+    assert main(["render", str(stage), str(tmp_path / "a.exr"), *flags]) == 0
+    picture = read_image(tmp_path / "a.exr")[..., :3]
+    clipped = int((picture == 65504.0).any(axis=-1).sum())
+    assert f"a.exr: {clipped} of 48 pixels exceed 65504" in capsys.readouterr().err and clipped > 0
+    assert any("exceed 65504" in line for line in json.loads((tmp_path / "s.json").read_text())["warnings"])
+    assert main(["render", str(stage), str(tmp_path / "a.exr"), *flags, "--float"]) == 0
+    assert "65504" not in capsys.readouterr().err and read_image(tmp_path / "a.exr").max() > 65504.0
+
+
 def test_render_writes_the_picture(tmp_path, capsys):
     """Stage in, picture out, one line of summary, and no word on stderr."""
     assert main(["render", ROOM, str(tmp_path / "a.exr"), *SMALL, "--aov", "depth", "normal"]) == 0

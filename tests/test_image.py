@@ -66,8 +66,13 @@ def test_half_and_rgbe_keep_their_digits(tmp_path, film):
 
 
 def test_half_overflow_is_the_largest_half(tmp_path):
-    """What 16 bits cannot hold becomes ±65504, never infinity."""
-    write_image(tmp_path / "a.exr", np.full((2, 2, 3), [65519.9, 1e30, -np.inf], dtype=np.float32))
+    """What 16 bits cannot hold becomes ±65504, never infinity; a warning counts the pixels."""
+    picture = np.zeros((2, 3, 3), np.float32)
+    picture[0, :2] = [65519.9, 1e30, -np.inf]
+    with pytest.warns(UserWarning, match=r"a\.exr: 2 of 6 pixels exceed 65504"):
+        write_image(tmp_path / "a.exr", picture)
+    write_image(tmp_path / "b.exr", picture, half=False)  # without a warning, which would be an error here
+    write_image(tmp_path / "b.exr", np.minimum(np.abs(picture), 65504.0))
     assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [65504.0, 65504.0, -65504.0]
 
 

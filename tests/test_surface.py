@@ -1,5 +1,8 @@
 """Rays start off the surface they leave, at any scale, and find the next one."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -73,6 +76,43 @@ def test_bad_meshes_never_reach_warp(launcher, change, message):
     bad = dataclasses.replace(mesh("/World/bad", *cube()), **change)
     with pytest.raises(ir.InputError, match=f"/World/bad: .*{message}"):
         upload_scene(ir.Scene(meshes=(bad,)), launcher)
+
+
+def _brightness(radiance=1.0, texture=1.0, emission=1.0, image=1.0, exposure=1.0):
+    """A square with a lamp, a texture on each."""
+    pixels = np.full((1, 1, 3), image, np.float32)
+    glowing = ir.Material("/Glow", emission=(emission,) * 3)
+    shining = ir.Material("/Shine", emission_texture=ir.Texture("a.exr", pixels))
+    lamp = ir.Light("/Lamp", ir.LightKind.RECT, (radiance,) * 3, texture=np.full((1, 1, 3), texture, np.float32))
+    square = mesh("m", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 1, 2]])
+    square = replace(square, material=np.array([0, 1], np.int32))
+    return ir.Scene(
+        meshes=(square,), materials=(glowing, shining), lights=(lamp,), camera=ir.Camera("/Eye", exposure=exposure)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "bright"),
+    [
+        ("/Lamp", dict(radiance=1e30)),
+        ("/Lamp", dict(radiance=1e39)),
+        ("/Lamp", dict(radiance=1e300)),
+        ("/Lamp", dict(radiance=math.inf)),
+        ("/Lamp", dict(radiance=1e20, texture=1e12)),
+        ("/Glow", dict(emission=1e39)),
+        ("/Shine", dict(image=1e35)),
+        ("/Eye", dict(exposure=1e20, radiance=1e20)),
+    ],
+)
+def test_radiance_beyond_float32_is_refused(launcher, name, bright):
+    """It would be infinite on the device, where samples that are not finite are replaced by black."""
+    with pytest.raises(ir.InputError, match=f"{name}.*(less than|in \\[0,|exceeds) ?1e\\+3"):
+        upload_scene(_brightness(**bright), launcher)
+
+
+@pytest.mark.parametrize("bright", [dict(radiance=9e29), dict(emission=9e29), dict(image=9e29), dict(exposure=9e37)])
+def test_radiance_of_any_other_size_is_accepted(launcher, bright):
+    assert upload_scene(_brightness(**bright), launcher).emits
 
 
 @pytest.mark.parametrize("triangles", [np.zeros((0, 3)), [[0, 0, 0]], [[0, 1, 1]]])

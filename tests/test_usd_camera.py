@@ -73,6 +73,14 @@ def test_the_lens_is_focal_length_over_f_stop_wide(tmp_path):
     assert load(tmp_path, camera_text("float focusDistance = 7")).camera.lens_radius == 0.0
 
 
+def test_a_lens_focused_at_infinity(tmp_path):
+    """A focus distance of infinity is one, and its lens blurs what is near."""
+    scene = load(tmp_path, camera_text("float fStop = 2\n float focusDistance = inf"))
+    assert scene.camera.lens_radius > 0.0 and scene.camera.focus_distance == np.inf and not warned(scene, "focus")
+    scene = load(tmp_path, camera_text("float fStop = 2\n float focusDistance = nan"))
+    assert scene.camera.lens_radius == 0.0 and warned(scene, "focusDistance is nan, not a finite number")
+
+
 @pytest.mark.parametrize("more", ["", 'token projection = "orthographic"\n float focusDistance = 7'])
 def test_a_lens_that_cannot_be_is_named(tmp_path, more):
     """Without a focus distance, or without perspective, an fStop blurs nothing."""

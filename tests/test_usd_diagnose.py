@@ -1,5 +1,7 @@
 """Black pictures say why, and no other picture does."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,47 @@ def Camera "Cam" {
 
 def ball(more: str = "", radius: float = 2.0) -> str:
     return f'{GLOW}def Sphere "Ball" {{ double radius = {radius}\n rel material:binding = </Glow>\n {more}\n}}\n'
+
+
+WALL = """
+def Xform "Room" {
+    def Cube "Box" {
+        double size = %s
+    }
+    double3 xformOp:translate = (0, 0, -1)
+    double3 xformOp:rotateXYZ = (0, 30, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]
+}
+"""
+
+
+@pytest.mark.parametrize("instanced", [False, True])
+@pytest.mark.parametrize(
+    ("size", "near", "turn", "touches"),
+    [
+        (4.0, 0.0, 30, True),  # the centre of a wall
+        (4.0, 1e-9, 30, True),
+        (4.0, 0.001, 30, False),  # the wall is clipped away
+        (4.001, 0.0, 30, False),
+        (4.0, 0.0, 0, False),  # inside the room
+        (3.0, 0.0, 30, False),
+    ],
+)
+def test_a_camera_in_a_wall(tmp_path, size, near, turn, touches, instanced):
+    """Rays that start in a surface hit it at once; only clipping lets them pass."""
+    x, z = 2.0 * math.sin(math.radians(turn)), 2.0 * math.cos(math.radians(turn)) - 1.0
+    camera = CAMERA % (near, 100, 0) if turn == 0 else (CAMERA % (near, 100, 0)).replace("(0, 0, 0)", f"({x}, 0, {z})")
+    room = WALL % size
+    if instanced:
+        room = f"""
+def PointInstancer "Many" {{
+    rel prototypes = </Many/Room>
+    int[] protoIndices = [0, 0]
+    point3f[] positions = [(100, 0, 0), (0, 0, 0)]
+    {room}
+}}"""
+    lines = [line for line in load(tmp_path, room + camera).warnings if "lies in the surface of" in line]
+    assert len(lines) == touches and all("Box" in line for line in lines)
 
 
 def test_a_camera_in_a_ball_that_glows_outwards(tmp_path):

@@ -1,5 +1,6 @@
 """Image assets: what is stored becomes linear light, from a folder or a package, whole or refused in one line."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,8 @@ import OpenImageIO as oiio
 import pytest
 from pxr import Sdf, Usd, UsdUtils
 
-from tests.stages import write_image
+from tests import fuzz
+from tests.stages import load, mesh, only_material, textured, warned, write_image
 from warp_ir.usd.images.asset import read_texture, srgb_to_linear
 from warp_ir.usd.values.report import Unreadable
 
@@ -133,3 +135,164 @@ def test_what_is_no_image_is_named(tmp_path):
     (tmp_path / "huge.png").write_bytes(header)
     with pytest.raises(Unreadable, match=r"huge\.png"):
         read_texture(str(tmp_path / "huge.png"))
+
+
+WINDOWS = [
+    ((4, 4, 4, 4), (0, 0, 8, 8)),  # a crop: a quarter of the picture
+    ((-2, -3, 12, 14), (0, 0, 8, 8)),  # overscan on all sides
+    ((2, -2, 12, 7), (-3, 1, 9, 8)),  # both, and an origin that is not 0
+    ((20, 20, 4, 4), (0, 0, 8, 8)),  # nothing that is seen
+]
+"""Data and display windows: left, top, width, height."""
+
+
+def _windowed(path, data, full, **layout):
+    """A file whose data window holds random colours; returns what the display window shows."""
+    x, y, width, height = data
+    values = np.random.default_rng(1).random((height, width, 3)).astype(np.float16).astype(np.float32)
+    spec = oiio.ImageSpec(width, height, 3, "float")
+    spec.x, spec.y = x, y
+    spec.full_x, spec.full_y, spec.full_width, spec.full_height = full
+    for name, value in layout.items():
+        setattr(spec, name, value)
+    writer = oiio.ImageOutput.create(str(path))
+    assert writer.open(str(path), spec), oiio.geterror()
+    assert writer.write_image(values), writer.geterror()
+    writer.close()
+    shown = np.zeros((full[3], full[2], 3), np.float32)
+    for row in range(height):
+        for column in range(width):
+            i, j = y + row - full[1], x + column - full[0]
+            if 0 <= i < full[3] and 0 <= j < full[2]:
+                shown[i, j] = values[row, column]
+    return shown
+
+
+@pytest.mark.parametrize("tile", [0, 16])
+@pytest.mark.parametrize(("data", "full"), WINDOWS)
+def test_texture_space_is_the_display_window(tmp_path, monkeypatch, data, full, tile):
+    """OpenEXR's data window is where the pixels are, the display window the picture; without data it is black."""
+    shown = _windowed(tmp_path / "a.exr", data, full, tile_width=tile, tile_height=tile)
+    image = read_texture(str(tmp_path / "a.exr"))
+    assert (image.width, image.height) == full[2:]
+    np.testing.assert_array_equal(image.pixels, shown)
+    monkeypatch.setattr("warp_ir.usd.images.asset._VALUES_PER_BAND", 30)
+    np.testing.assert_array_equal(read_texture(str(tmp_path / "a.exr")).pixels, shown)
+    small = read_texture(str(tmp_path / "a.exr"), max_pixels=9).pixels
+    factor = -(-full[2] // small.shape[1])
+    for i in range(small.shape[0]):
+        for j in range(small.shape[1]):
+            block = shown[factor * i :, factor * j :][:factor, :factor].mean(axis=(0, 1), dtype=np.float64)
+            np.testing.assert_allclose(small[i, j], block, atol=1e-6)  # float32, one rounding per band
+
+
+def test_a_tiff_of_a_larger_picture(tmp_path):
+    """TIFF has an offset and the full size; without the latter an offset is a place on a page, and not in a texture."""
+    shown = _windowed(tmp_path / "a.tif", (2, 3, 4, 4), (0, 0, 8, 9))
+    np.testing.assert_array_equal(read_texture(str(tmp_path / "a.tif")).pixels, shown)
+    _windowed(tmp_path / "b.tif", (2, 3, 4, 4), (0, 0, 4, 4))  # a full size equal to the image's is not written
+    shown = _windowed(tmp_path / "c.tif", (0, 0, 4, 4), (0, 0, 4, 4))
+    np.testing.assert_array_equal(read_texture(str(tmp_path / "b.tif")).pixels, shown)
+
+
+def test_alpha_outside_the_data_window(tmp_path):
+    """Where there is no data, a file with alpha is transparent, and one without is opaque."""
+    for channels, expected in ((3, 1.0), (4, 0.0)):
+        spec = oiio.ImageSpec(1, 1, channels, "half")
+        spec.x, spec.full_width = 1, 2
+        writer = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+        assert writer.open(str(tmp_path / "a.exr"), spec) and writer.write_image(np.ones((1, 1, channels), np.float32))
+        writer.close()
+        assert read_texture(str(tmp_path / "a.exr")).alpha.tolist() == [[expected, 1.0]]
+
+
+def test_a_window_that_claims_too_much(tmp_path):
+    """A display window is limited as an image is."""
+    spec = oiio.ImageSpec(1, 1, 3, "half")
+    spec.full_width = spec.full_height = 1_000_000
+    writer = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+    assert writer.open(str(tmp_path / "a.exr"), spec) and writer.write_image(np.ones((1, 1, 3), np.float32))
+    writer.close()
+    with pytest.raises(Unreadable, match="claims 1000000 x 1000000 pixels"):
+        read_texture(str(tmp_path / "a.exr"))
+
+
+@pytest.mark.parametrize("light", ["DomeLight", "RectLight"])
+@pytest.mark.parametrize(("data", "full"), WINDOWS[:3])
+def test_windows_of_textures_on_lights(tmp_path, light, data, full):
+    """An overscanned sky is no brighter than the same sky without overscan."""
+    shown = _windowed(tmp_path / "a.exr", data, full)
+    scene = load(tmp_path, f'def {light} "L" {{\n asset inputs:texture:file = @a.exr@\n}}\n' + mesh("", material="/B"))
+    (lamp,) = scene.lights
+    np.testing.assert_array_equal(lamp.texture, shown)
+
+
+def test_windows_of_textures_on_surfaces(tmp_path):
+    """The mean albedo of a picture whose data fill a quarter of it is a quarter of theirs."""
+    shown = _windowed(tmp_path / "a.exr", *WINDOWS[0])
+    material = only_material(load(tmp_path, textured(file="a.exr") + mesh()))
+    np.testing.assert_allclose(material.albedo, shown.mean(axis=(0, 1)), rtol=2.0**-11)
+
+
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("Y",)])
+def test_the_part_with_colour_counts(tmp_path, names):
+    """Of a multi-part EXR it is the part with R, G and B, else with luminance, in whatever place."""
+    parts = [("Z",), ("N.X", "N.Y", "N.Z"), names, ("albedo.R", "albedo.G", "albedo.B")]
+    specs = []
+    for k, channels in enumerate(parts):
+        spec = oiio.ImageSpec(2, 3, len(channels), "float")
+        spec.channelnames = channels
+        spec.attribute("oiio:subimagename", f"part{k}")
+        specs.append(spec)
+    path = str(tmp_path / "a.exr")
+    writer = oiio.ImageOutput.create(path)
+    assert writer.open(path, tuple(specs)), oiio.geterror()
+    for k, spec in enumerate(specs):
+        assert k == 0 or writer.open(path, spec, "AppendSubimage")
+        assert writer.write_image(np.full((3, 2, len(parts[k])), float(k), np.float32))
+    writer.close()
+    image = read_texture(path)
+    assert image.pixels.shape == (3, 2, len(names)) and (image.pixels == 2.0).all()
+
+
+def test_damage_that_no_text_can_quote(tmp_path):
+    """An error message that quotes bytes which are no UTF-8 is a warning, and the texture's fallback is used."""
+    write_image(tmp_path / "a.exr", np.ones((4, 4, 3), np.float32), "half")
+    content = (tmp_path / "a.exr").read_bytes()
+    fallback = "float4 inputs:fallback = (0.25, 0.5, 0.75, 1)"
+    for good, bad in ((b"chlist", b"\xff\xfelist"), (b"dataWindow\0box", b"dataWindow\0\xffox")):
+        assert content.count(good) == 1
+        (tmp_path / "a.exr").write_bytes(content.replace(good, bad))
+        with pytest.raises(Unreadable, match="cannot be read") as error:
+            read_texture(str(tmp_path / "a.exr"))
+        assert str(error.value).isprintable()
+        scene = load(tmp_path, textured(fallback, file="a.exr") + mesh())
+        assert warned(scene, "a.exr", "cannot be read", "fallback")
+        np.testing.assert_allclose(only_material(scene).albedo, (0.25, 0.5, 0.75))
+
+
+@pytest.mark.extended
+def test_mutated_images_are_read_or_refused(tmp_path):
+    """500 files with bytes flipped, moved and cut: an image, or one line; nothing else."""
+    sources = []
+    pixels = np.random.default_rng(1).random((16, 24, 3), np.float32)
+    for compression in ("none", "rle", "zip", "piz", "pxr24", "b44", "dwaa"):
+        sources.append(write_image(tmp_path / f"{compression}.exr", pixels, "half", compression=compression))
+    sources += [write_image(tmp_path / f"a.{name}", pixels, "float") for name in ("exr", "tif", "hdr")]
+    sources += [write_image(tmp_path / f"b.{name}", np.uint8(255 * pixels)) for name in ("png", "tif", "jpg", "tga")]
+    for tile, name in ((0, "w.exr"), (16, "t.exr"), (0, "w.tif")):
+        _windowed(tmp_path / name, (1, 2, 20, 21), (0, 0, 30, 30), tile_width=tile, tile_height=tile)
+        sources.append(str(tmp_path / name))
+    contents = [(path, Path(path).read_bytes()) for path in sources]
+    read = 0
+    for seed in range(500):
+        path, content = contents[seed % len(contents)]
+        mutant = tmp_path / f"mutant{path[path.rindex('.') :]}"
+        mutant.write_bytes(fuzz.damage(content, np.random.default_rng(seed)))
+        try:
+            image = read_texture(str(mutant))
+            assert np.isfinite(image.pixels).all()
+            read += 1
+        except Unreadable as error:
+            assert str(error).isprintable(), f"seed {seed}"
+    assert 50 < read < 450  # mutations that never, or always, stop the reader test little

@@ -182,6 +182,22 @@ def test_absurd_inputs_skip_the_light(tmp_path, bad):
     assert scene.lights == () and warned(scene, "/L", "skipped")
 
 
+def test_products_beyond_float32_skip_the_light(tmp_path):
+    """Each factor alone would do: a texture times an intensity, a material's emission times a light's."""
+    write_image(tmp_path / "t.exr", np.full((1, 1, 3), 1e11, np.float32), "float")
+    more = "asset inputs:texture:file = @t.exr@\n    float inputs:intensity = 1e25"
+    for kind in ("RectLight", "DomeLight"):
+        scene = load(tmp_path, light_text(kind, more))
+        assert scene.lights == () and warned(scene, "/L", "exceeds 1e+30; the light is skipped")
+    glow = stages.material_text("color3f inputs:emissiveColor = (1e20, 1e20, 1e20)")
+    panel = stages.mesh("float inputs:intensity = 1e20").replace(
+        '"MaterialBindingAPI"', '"MaterialBindingAPI", "MeshLightAPI"'
+    )
+    scene = load(tmp_path, glow + panel)
+    assert max(max(m.emission) for m in scene.materials) == pytest.approx(1e20)
+    assert warned(scene, "/M", "exceeds 1e+30; it does not emit as a light")
+
+
 def test_inputs_without_prefix_are_read(tmp_path):
     """Files from before 21.02 have plain names; authored inputs: win."""
     scene = load(tmp_path, light_text("DistantLight", "float intensity = 3000"))

@@ -153,6 +153,55 @@ def test_inline_materialx(tmp_path, shader, inputs, albedo, emission):
     assert material.albedo == pytest.approx(albedo) and material.emission == pytest.approx(emission)
 
 
+GREEN = ("mtlx:surface", "ND_standard_surface_surfaceshader", "float inputs:base = 1\n color3f inputs:base_color")
+RED = ("surface", "UsdPreviewSurface", "color3f inputs:diffuseColor")
+BLUE = ("ri:surface", "PxrDisneyBsdf", "color3f inputs:baseColor")
+
+
+def _offering(*offers):
+    """A material with a surface for each (output, shader, input of its colour), red, green and blue in that order."""
+    text = 'def Material "A" {\n'
+    for k, (output, shader, color) in enumerate(offers):
+        text += f"""
+    token outputs:{output}.connect = </A/S{k}.outputs:out>
+    def Shader "S{k}" {{
+        uniform token info:id = "{shader}"
+        {color} = {tuple(float(i == k) for i in range(3))}
+        token outputs:out
+    }}"""
+    return text + "\n}\n" + BOUND
+
+
+@pytest.mark.parametrize(
+    ("offers", "used", "named"),
+    [
+        ((RED, GREEN), 1, "outputs:mtlx:surface"),
+        ((GREEN, RED), 0, "outputs:mtlx:surface"),
+        ((BLUE, RED, GREEN), 2, "outputs:mtlx:surface"),
+        ((("mtlx:surface", "ND_layered_anything", GREEN[2]), RED), 1, "outputs:surface"),
+        ((BLUE, RED), 1, None),
+        ((BLUE, GREEN), 1, None),
+        ((RED,), 0, None),
+        ((GREEN,), 0, None),
+    ],
+)
+def test_materialx_comes_before_the_universal_surface(tmp_path, offers, used, named):
+    """Storm's render contexts are mtlx, then the universal one; where both are offered, the one used is named."""
+    scene = load(tmp_path, _offering(*offers))
+    expected = np.eye(3)[used] * only_material(scene).albedo
+    assert only_material(scene).albedo == pytest.approx(expected) and max(expected) > 0.7
+    assert warned(scene, "/A", f"{named} is used (1 materials)") if named else not warned(scene, "is used")
+
+
+def test_one_surface_for_both_contexts_is_no_choice(tmp_path):
+    """Two outputs with one shader need no word."""
+    both = "token outputs:mtlx:surface.connect = </A/S.outputs:surface>\n"
+    text = material_text("color3f inputs:diffuseColor = (1, 0, 0)").replace(
+        "    def Shader", f"    {both}    def Shader", 1
+    )
+    assert not warned(load(tmp_path, text + BOUND), "is used")
+
+
 @pytest.mark.parametrize(
     ("text", "word"),
     [

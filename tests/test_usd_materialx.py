@@ -203,12 +203,48 @@ def Material "T" {
 BAD = {
     "no XML": "<materialx version='1.38'><surfacematerial",
     "nested too deeply": "<materialx>" + "<a>" * 500 + "</a>" * 500 + "</materialx>",
-    "document type": '<!DOCTYPE x [<!ENTITY a "b">]><materialx version="1.38"/>',
+    "declaration has no end": '<!DOCTYPE x [<!ENTITY a "b">] ',
+    "mismatch": "<materialx version='1.38'><a></b></materialx>",
     "no MaterialX": "<usd/>",
     "bytes; the limit": "<materialx>" + " " * 2**24 + "</materialx>",
     "included documents are not read": DOCUMENT.replace("<nodegraph", '<xi:include href="b.mtlx"/><nodegraph', 1),
     "which is not there": DOCUMENT.replace('nodename="half"', 'nodename="nobody"'),
 }
+
+
+DECLARATION = '<?xml version="1.0"?>'
+LENIENT = {
+    "blanks": " \n\t" + DECLARATION + DOCUMENT.removeprefix(DECLARATION),
+    "mark": "\ufeff " + DECLARATION + DOCUMENT.removeprefix(DECLARATION),
+    "comment": "<!-- <a> -->" + DECLARATION + DOCUMENT.removeprefix(DECLARATION),
+    "text": "A&B " + DOCUMENT + " & <materialx/> the end \0 <a",
+    "type": '<!DOCTYPE materialx [<!ELEMENT a (b)> <!ENTITY c "]>"> <!-- ]> --> <?x ]>?>]>'
+    + DOCUMENT.removeprefix(DECLARATION),
+    "attributes": DOCUMENT.replace("<nodegraph", """<nodegraph doc="a < b & c > d />" note='"<x>"'""", 1),
+    "data": DOCUMENT.replace("<nodegraph", "<![CDATA[" + "<a>" * 100 + "]]><?x <b> ?><nodegraph", 1),
+}
+"""Documents that USD's own reader takes, though they are no well-formed XML or seldom written so."""
+
+
+@pytest.mark.parametrize("text", LENIENT.values(), ids=LENIENT)
+def test_what_the_librarys_parser_reads(looks, text):
+    """The same scene as without the oddity."""
+    expected = only_material(load(looks, ROOT + mesh()))
+    (looks / "looks.mtlx").write_text(text, encoding="utf-8")
+    scene = load(looks, ROOT + mesh())
+    assert only_material(scene).albedo == expected.albedo and not warned(scene, "MaterialX document")
+
+
+@pytest.mark.parametrize("head", ['<a b="', "<!--", "<?", "<![CDATA[", "<!DOCTYPE ", "</"])
+def test_depth_is_found_behind_any_markup(tmp_path, head):
+    """What hides elements from the check hides them from the parser as well, which recurses."""
+    end = {"<a b=": '"/>', "<!--": "-->", "<?": "?>", "<![CDATA[": "]]>", "<!DOCTYPE ": ">", "</": ">"}[
+        head.rstrip('"')
+    ]
+    inner = "<b>" if head.startswith("<a") else "x"
+    text = f"{head}{inner}{end}<materialx>" + "<a>" * 500 + "</a>" * 500 + "</materialx>"
+    (tmp_path / "looks.mtlx").write_text(text)
+    assert warned(load(tmp_path, ROOT + mesh()), "looks.mtlx", "nested too deeply")
 
 
 @pytest.mark.parametrize("words", BAD)

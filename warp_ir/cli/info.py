@@ -71,10 +71,10 @@ def describe(scene: Scene, reader: "StageReader", seconds: float, time_code: Tim
             "aspect": scene.camera.aspect,
             "position": _floats(scene.camera.world_from_camera[:3, 3]),
             "window": _floats(scene.camera.window),
-            "clipping": [camera.clipping[0], camera.clipping[1] if math.isfinite(camera.clipping[1]) else None],
+            "clipping": [camera.clipping[0], _finite(camera.clipping[1])],
             "exposure": camera.exposure,
             "lens_radius": camera.lens_radius,
-            "focus_distance": camera.focus_distance if camera.lens_radius > 0.0 else None,
+            "focus_distance": _finite(camera.focus_distance) if camera.lens_radius > 0.0 else None,
             "shutter_moments": len(scene.shutter),
         },
         "moving_meshes": reader.moving_meshes,
@@ -167,6 +167,11 @@ def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
     return guesses
 
 
+def _finite(number: float) -> float | None:
+    """The number; None, as JSON has no infinity, if it is not finite."""
+    return number if math.isfinite(number) else None
+
+
 def _floats(values: Iterable[float]) -> list[float]:
     return [float(value) for value in values]
 
@@ -193,7 +198,9 @@ def _print_table(facts: dict[str, Any], max_lines: float) -> None:
     )
     _list("other cameras", [name for name in facts["cameras"] if name != camera["name"]], max_lines)
     if camera["lens_radius"] > 0.0:
-        _row("lens", f"radius {camera['lens_radius']:.4g}, in focus at {camera['focus_distance']:.4g}")
+        focus = camera["focus_distance"]
+        in_focus = "infinity" if focus is None else f"{focus:.4g}"
+        _row("lens", f"radius {camera['lens_radius']:.4g}, in focus at {in_focus}")
     if camera["shutter_moments"]:
         _row("motion blur", f"{camera['shutter_moments']} shutter samples")
     if camera["exposure"] != 1.0:

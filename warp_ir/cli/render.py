@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from warp_ir.usd import StageReader
     from warp_ir.usd.settings.render_spec import Product
 
-_EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
+_EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black", "covers the picture")
 """Words of the warnings of a scene that explain a black picture."""
 _IN_SURFACE = 1e-6
 """Depth in units of the scene's size below which a camera lies in the surface that it sees."""
@@ -185,6 +186,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
     stop_signal = int(film.interrupted)
     code = 128 + stop_signal if stop_signal else 0
     written: list[Path] = []
+    write_warnings: list[str] = []
     if film.iterations or not stop_signal:
         begin = time.perf_counter()
         metadata: dict[str, object] = {
@@ -195,16 +197,19 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
-        for file, aovs in picture.files.items():
-            written += write_image(
-                file,
-                film,
-                aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
-                exposure=args.exposure,
-                tonemap=args.tonemap,
-                half=args.half,
-                metadata=metadata,
-            )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            for file, aovs in picture.files.items():
+                written += write_image(
+                    file,
+                    film,
+                    aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
+                    exposure=args.exposure,
+                    tonemap=args.tonemap,
+                    half=args.half,
+                    metadata=metadata,
+                )
+        write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
     if not stop_signal:
         checkpoint.remove()
@@ -212,9 +217,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         say(f"{checkpoint.path}: --resume continues from this checkpoint")
     blank = _blank_picture(scene, film)
     explained = any(words in line for line in scene.warnings for words in _EXPLANATIONS)
-    blank_warnings = [f"{scene.camera.name}: {blank}"] if blank and not explained else []
-    if blank_warnings and not args.quiet:
-        say_warnings(blank_warnings)
+    picture_warnings = [*([f"{scene.camera.name}: {blank}"] if blank and not explained else []), *write_warnings]
+    if not args.quiet:
+        say_warnings(picture_warnings)
     _summarize(job, path, film, written=bool(written), blank=bool(blank))
     statistics = {
         "output": [str(file) for file in written],
@@ -232,7 +237,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         "loaded": dict(scene.stats),
         "kept": reused,
         "counts": dict(film.counts),
-        "warnings": [*scene.warnings, *blank_warnings],
+        "warnings": [*scene.warnings, *picture_warnings],
     }
     return statistics, code
 

@@ -57,8 +57,8 @@ def camera_data(camera: Camera, frame: DeviceFrame, settings: RenderSettings) ->
         raise InputError(f"camera {camera.name!r}: the window is empty")
     perspective = camera.projection == Projection.PERSPECTIVE
     lens = camera.lens_radius if perspective and settings.depth_of_field else 0.0
-    if not (0.0 <= lens < np.inf and (lens == 0.0 or 0.0 < camera.focus_distance < np.inf)):
-        raise InputError(f"camera {camera.name!r}: lens_radius and focus_distance must be finite and not negative")
+    if not (0.0 <= lens < np.inf and (lens == 0.0 or camera.focus_distance > 0.0)):
+        raise InputError(f"camera {camera.name!r}: lens_radius must be finite, and focus_distance positive")
     fitted = camera.fit(settings.width, settings.height, settings.conform, settings.pixel_aspect)
     left, right, bottom, top = fitted.window
     unit = 1.0 if perspective else frame.scale

@@ -6,12 +6,14 @@ import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.geometry_storage import emissive_meshes
-from warp_ir.scene import InputError, LightKind, Material, Mesh, Scene, materials_of
+from warp_ir.scene import MAX_RADIANCE, InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000
 """Largest number of triangles of a scene; one with more is rejected before anything is allocated."""
 _BYTES_PER_TRIANGLE = 200
 _BYTES_PER_INSTANCE = 400
+_MAX_EXPOSED_RADIANCE = 1.0e38
+"""Largest radiance times exposure, which a film stores as float32."""
 _MAX_NORMAL_COMPONENT = 1.0e6
 """Largest component of a normal map, so that its square is finite."""
 
@@ -53,13 +55,21 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
         _check_material(material)
         if not all(0.0 <= a <= 1.0 for a in material.albedo):
             raise InputError(f"{material.name}: albedo must lie in [0, 1], is {material.albedo}")
-        if not all(0.0 <= e < np.inf for e in material.emission):
-            raise InputError(f"{material.name}: emission must be finite and not negative, is {material.emission}")
-        if material.glow is not None and not all(0.0 <= e < np.inf for e in material.glow):
-            raise InputError(f"{material.name}: glow must be finite and not negative, is {material.glow}")
+        for name, emission, image in (
+            ("emission", material.emission, material.emission_texture),
+            ("glow", material.glow or (0.0, 0.0, 0.0), material.glow_texture),
+        ):
+            if not all(0.0 <= e < MAX_RADIANCE for e in emission):
+                raise InputError(f"{material.name}: {name} must be in [0, {MAX_RADIANCE:g}), is {emission}")
+            if image is not None and not max(float(image.pixels.max()), *image.outside) < MAX_RADIANCE:
+                raise InputError(f"{material.name}: texture {image.name}: {name} must be less than {MAX_RADIANCE:g}")
+    brightest = max([0.0, *(max(m.emission) for m in scene.materials), *(max(x.radiance) for x in scene.lights)])
+    if not scene.camera.exposure * brightest < _MAX_EXPOSED_RADIANCE:
+        what = f"exposure {scene.camera.exposure:g} times radiance {brightest:g} exceeds {_MAX_EXPOSED_RADIANCE:g}"
+        raise InputError(f"camera {scene.camera.name!r}: {what}")
     for light in scene.lights:
-        if not all(0.0 <= e < np.inf for e in light.radiance):
-            raise InputError(f"{light.name}: radiance must be finite and not negative, is {light.radiance}")
+        if not all(0.0 <= e < MAX_RADIANCE for e in light.radiance):
+            raise InputError(f"{light.name}: radiance must be in [0, {MAX_RADIANCE:g}), is {light.radiance}")
         if light.world_from_light.shape != (4, 4) or not np.isfinite(light.world_from_light).all():
             raise InputError(f"{light.name}: world_from_light must be a finite 4x4 matrix")
         texture = light.texture
@@ -70,6 +80,8 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
                 raise InputError(f"{light.name}: texture must have shape [h, w, 3]")
             if not (np.isfinite(texture).all() and texture.min() >= 0.0):
                 raise InputError(f"{light.name}: texture must be finite and not negative")
+            if not float(texture.max()) * max(light.radiance) < MAX_RADIANCE:
+                raise InputError(f"{light.name}: radiance times texture must be less than {MAX_RADIANCE:g}")
 
 
 def _check_material(material: Material) -> None:

@@ -5,6 +5,7 @@
 
 import os
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -99,7 +100,8 @@ def write_image(
         aov: Name of the film's AOV to write in place of its radiance.
         aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
             to a file of its own: picture.NAME.png for picture.png.
-        half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped.
+        half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped,
+            with a warning that counts their pixels.
         metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
         color_space: One of `COLOR_SPACES`, for colours in the linear formats; None: that of the film's settings, or
             linear Rec. 709 for an array.
@@ -156,11 +158,14 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
-    pixels = reader.read_image(oiio.FLOAT) if reader else None
-    if reader is None or pixels is None:
-        raise InputError(f"{path}: {_first_line(reader.geterror() if reader else oiio.geterror())}")
-    names = list(reader.spec().channelnames)
-    reader.close()
+    try:
+        pixels = reader.read_image(oiio.FLOAT) if reader else None
+        if reader is None or pixels is None:
+            raise InputError(f"{path}: {oiio_error(reader)}")
+        names = list(reader.spec().channelnames)
+        reader.close()
+    except UnicodeDecodeError as error:  # names in a damaged file
+        raise InputError(f"{path}: {first_line(str(error))}") from None
     pixels = np.asarray(pixels, dtype=np.float32).reshape(*pixels.shape[:2], -1)
     if layer is None:
         wanted = [name for name in ("R", "G", "B", "A") if name in names] or names
@@ -311,6 +316,15 @@ def _write_exr(
         np.clip(plane, -_HALF_MAX, _HALF_MAX) if stored == oiio.HALF else plane
         for (plane, _), stored in zip(channels.values(), formats, strict=True)
     ]
+    beyond = [
+        np.abs(plane) > _HALF_MAX
+        for (plane, _), stored in zip(channels.values(), formats, strict=True)
+        if stored == oiio.HALF
+    ]
+    clipped = int(np.any(beyond, axis=0).sum()) if beyond else 0
+    if clipped:
+        what = f"{clipped} of {beyond[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
+        warnings.warn(f"{path}: {what}; 32 bits hold them (half=False, --float)", stacklevel=3)
     pixels = np.stack(planes, axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])
     spec.channelformats = tuple(formats)
@@ -382,13 +396,13 @@ def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.ui
     with whole_file(path) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
-            raise OSError(_first_line(oiio.geterror()))
+            raise OSError(oiio_error())
         # close() flushes, and geterror() tells of failures that the other calls do not report.
         good = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
         good = writer.close() and good
-        message = writer.geterror()
+        message = oiio_error(writer)
         if message or not good:
-            raise OSError(_first_line(message) or "unknown error")
+            raise OSError(message or "unknown error")
 
 
 def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict[str, str | float]:
@@ -417,9 +431,26 @@ def _reason(error: Exception) -> str:
     """The reason of an error, without the path, which the message names already."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
-    return _first_line(str(error))
+    return first_line(str(error))
 
 
-def _first_line(text: str) -> str:
+def first_line(text: str) -> str:
+    """The first line of a message, "" if it has none; characters that cannot be printed are replaced."""
     lines = text.strip().splitlines()
-    return lines[0].strip() if lines else ""
+    line = lines[0].strip() if lines else ""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+
+
+def oiio_error(source: "oiio.ImageInput | oiio.ImageOutput | None" = None) -> str:
+    """The first line of OpenImageIO's last error message, which this clears; "" if there was none.
+
+    Args:
+        source: The reader or writer that failed; None: opening one failed.
+    """
+    import OpenImageIO as oiio
+
+    try:
+        text = str(oiio.geterror() if source is None else source.geterror())
+    except UnicodeDecodeError as error:  # the message quotes bytes of the file
+        text = bytes(error.object).decode("utf-8", "replace")
+    return first_line(text)

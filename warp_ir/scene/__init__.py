@@ -4,6 +4,7 @@ from warp_ir.scene.camera import CONFORM_POLICIES, MAX_CLIPPING_PLANES, Camera, 
 from warp_ir.scene.measure import materials_of
 from warp_ir.scene.scene import Scene
 from warp_ir.scene.types import (
+    MAX_RADIANCE,
     Bools,
     Color,
     Floats,
@@ -23,6 +24,7 @@ from warp_ir.scene.types import (
 __all__ = [
     "CONFORM_POLICIES",
     "MAX_CLIPPING_PLANES",
+    "MAX_RADIANCE",
     "Bools",
     "Camera",
     "Color",

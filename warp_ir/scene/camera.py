@@ -47,7 +47,7 @@ class Camera:
     lens_radius: float = 0.0
     """Radius of the thin lens of a perspective camera, in scene units; 0: a pinhole camera without defocus."""
     focus_distance: float = 1.0
-    """Depth along -Z that a camera with a lens has in focus, in scene units."""
+    """Depth along -Z that a camera with a lens has in focus, in scene units; `math.inf`: what is infinitely far."""
     clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
     """At most `MAX_CLIPPING_PLANES` planes (a, b, c, d) in the camera's space: camera rays hit only surfaces where
     a x + b y + c z + d >= 0."""

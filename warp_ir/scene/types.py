@@ -17,6 +17,9 @@ Floats = npt.NDArray[np.floating]
 Ints = npt.NDArray[np.integer]
 Bools = npt.NDArray[np.bool_]
 
+MAX_RADIANCE = 1e30
+"""Upper limit of radiance; larger values are errors in the input, and overflow float32 when scaled or summed."""
+
 
 class InputError(ValueError):
     """The user's input cannot be rendered; the message is one line that names what is wrong and where."""

@@ -114,7 +114,9 @@ def read_camera(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Camera:
     half_y = 0.5 * positive(camera.GetVerticalApertureAttr(), 15.2908)
     x = optional(camera.GetHorizontalApertureOffsetAttr(), 0.0)
     y = optional(camera.GetVerticalApertureOffsetAttr(), 0.0)
-    lens_radius, focus = 0.0, optional(camera.GetFocusDistanceAttr(), 0.0)
+    lens_radius, focus = 0.0, math.inf
+    if read.raw(camera.GetFocusDistanceAttr(), time) != math.inf:  # a lens may be focused at infinity
+        focus = optional(camera.GetFocusDistanceAttr(), 0.0)
     f_stop = optional(camera.GetFStopAttr(), 0.0)
     if f_stop > 0.0 and projection == Projection.ORTHOGRAPHIC:
         report.warn(prim.GetPath(), "fStop: an orthographic camera has no depth of field")

@@ -7,14 +7,20 @@ from contextlib import suppress
 import numpy as np
 from pxr import Usd, UsdLux
 
-from warp_ir.scene import Camera, Floats, Mesh, Scene
+from warp_ir.scene import Camera, Floats, Mesh, Projection, Scene
 from warp_ir.usd.lights.inputs import LightInputs
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
+_TOUCHING = 2.0**-22
+"""Distance to a surface, relative to the extent, that float32 in the device frame may round to 0."""
+
 
 def diagnose_black_picture(scene: Scene, report: Report) -> None:
-    """Warns if no geometry is between the camera's clipping planes, or if all emitters face away from the camera."""
+    """Warns if no geometry is between the camera's clipping planes, or if all emitters face away from the camera.
+
+    It also warns of a camera in a surface, which then hides the scene from it.
+    """
     if not any(len(mesh.triangles) for mesh in scene.meshes):
         return
     camera = scene.camera
@@ -26,6 +32,10 @@ def diagnose_black_picture(scene: Scene, report: Report) -> None:
         report.warn(camera.name, f"clippingRange: near, {near:g}, lies behind all geometry, which ends at {farthest:g}")
     elif nearest > far:
         report.warn(camera.name, f"clippingRange: far, {far:g}, lies before all geometry, which begins at {nearest:g}")
+    surface = _surface_around_eye(scene)
+    if surface is not None:
+        what = f"it lies in the surface of {surface.name}, which covers the picture; clip it away by clippingRange"
+        report.warn(camera.name, what)
     for mesh in _emitters_facing_away(scene):
         why = "the camera is inside it, and it emits outwards only (doubleSided, orientation)"
         report.warn(mesh.name, f"{why}: the picture is black")
@@ -41,6 +51,49 @@ def _depths(scene: Scene, camera: Camera) -> tuple[float, float]:
     # Points are float32: the box has their relative error.
     slack = 1e-6 * (np.abs(corners).max() + np.abs(camera.world_from_camera[:3, 3]).max())
     return float(depth.min() - slack), float(depth.max() + slack)
+
+
+def _surface_around_eye(scene: Scene) -> Mesh | None:
+    """A mesh that the eye of a perspective camera touches and its clipping does not remove; None: there is none."""
+    lower, upper = scene.bounds()
+    slack = _TOUCHING * float(np.linalg.norm(upper - lower))
+    eye = scene.camera.world_from_camera[:3, 3]
+    in_box = ((lower - slack <= eye) & (eye <= upper + slack)).all()
+    if scene.camera.projection != Projection.PERSPECTIVE or scene.camera.clipping[0] > slack or not in_box:
+        return None
+    instanced = {k for group in scene.instances for k in group.meshes}
+    for k, mesh in enumerate(scene.meshes):
+        if k not in instanced and _touches(mesh, eye, slack):
+            return mesh
+    for group in scene.instances:
+        linear, to_eye = group.matrices[:, :3, :3], eye - group.matrices[:, :3, 3]
+        scale, distance = np.linalg.norm(linear, axis=(1, 2)), np.linalg.norm(to_eye, axis=1)
+        for mesh in (scene.meshes[k] for k in group.meshes):
+            radius = float(np.linalg.norm(mesh.points, axis=1).max(initial=0.0))
+            for i in np.nonzero(distance <= scale * radius + slack)[0]:
+                with suppress(np.linalg.LinAlgError):  # an instance that is flat
+                    if _touches(mesh, np.linalg.solve(linear[i], to_eye[i]), slack / float(scale[i])):
+                        return mesh
+    return None
+
+
+def _touches(mesh: Mesh, point: Floats, slack: float) -> bool:
+    """Whether a point lies in a triangle of a mesh, up to a distance."""
+    # The sides on which a vertex lies, one bit each: triangles with a common side are elsewhere (Cohen, Sutherland).
+    codes = np.zeros(len(mesh.points), np.uint8)
+    for axis in range(3):
+        codes |= (mesh.points[:, axis] > point[axis] + slack).astype(np.uint8) << (2 * axis)
+        codes |= (mesh.points[:, axis] < point[axis] - slack).astype(np.uint8) << (2 * axis + 1)
+    first, second, third = (mesh.triangles[:, k] for k in range(3))
+    near = mesh.triangles[(codes[first] & codes[second] & codes[third]) == 0]
+    corners = mesh.points[near] - point
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    touches = (length > 0.0) & (np.abs(np.sum(normal * a, axis=1)) <= slack * length)
+    for p, q in ((a, b), (b, c), (c, a)):
+        touches &= np.sum(normal * np.cross(p, q), axis=1) >= -slack * length * np.linalg.norm(q - p, axis=1)
+    return bool(touches.any())
 
 
 def _emitters_facing_away(scene: Scene) -> list[Mesh]:

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Ar, Sdf
 
+from warp_ir.image.io import first_line, oiio_error
 from warp_ir.scene import Floats
 from warp_ir.usd.values import source_color_space
 from warp_ir.usd.values.report import Unreadable
@@ -33,6 +34,8 @@ _MAX_VALUES = 2**31
 """Maximum of pixels times channels in a file; one that claims more is taken for damaged or malicious."""
 _VALUES_PER_BAND = 2**22
 """Values (pixels times channels) decoded at once."""
+_WINDOWED_FORMATS = {"openexr", "tiff"}
+"""OpenImageIO's names of formats whose files state a display window; offsets in others place no texture."""
 _LINEAR_NAMES = {"linear", "lin_rec709", "lin_rec709_scene", "scene_linear", "raw", "data"}
 
 
@@ -41,11 +44,12 @@ class Image:
     """A decoded image."""
 
     pixels: npt.NDArray[np.float32]
-    """float32 [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4 (rgb, alpha)."""
+    """The display window, float32 [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4
+    (rgb, alpha). It is 0 where the file holds no data."""
     width: int
-    """Width in the file; `pixels` may be averaged down."""
+    """Width of the display window; `pixels` may be averaged down."""
     height: int
-    """Height in the file."""
+    """Height of the display window."""
     decoded: bool = False
     """Whether a transfer function was decoded, that is, colour was not linear in the file."""
     wrap: tuple[str, str] = ("", "")
@@ -95,10 +99,12 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
             if path is None:
                 raise Unreadable("not found")
             if reader is None:
-                raise Unreadable(f"cannot be read: {_first_line(oiio.geterror(), path)}")
+                raise Unreadable(f"cannot be read: {_without_path(oiio_error(), path)}")
             return _decode(reader, path, color_space, max_pixels)
         except Unreadable as error:
             raise Unreadable(f"image '{_short(authored)}' {error}") from None
+        except Exception as error:  # names and metadata of damaged files raise errors of many kinds
+            raise Unreadable(f"image '{_short(authored)}' cannot be read: {first_line(str(error))}") from None
         finally:
             if reader is not None:
                 reader.close()
@@ -123,15 +129,19 @@ def _file(resolved: str) -> "Iterator[str | None]":
         yield str(path)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # damaged files hold any bits
 def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: int) -> Image:
+    """Decodes the display window, which texture coordinates span; outside the data window it is 0."""
     import OpenImageIO as oiio
 
+    part = _select_part(reader)
     spec = reader.spec()
-    width, height, channels = int(spec.width), int(spec.height), int(spec.nchannels)
-    if min(width, height, channels) < 1 or spec.depth > 1 or spec.deep:
+    if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1 or spec.deep:
         raise Unreadable("is not a flat two-dimensional image of at least one pixel")
-    if width * height * channels > _MAX_VALUES:
-        raise Unreadable(f"claims {width} x {height} pixels of {channels} channels: too many")
+    left, top, width, height = _display_window(reader)
+    for w, h in ((width, height), (spec.width, spec.height)):
+        if w * h * spec.nchannels > _MAX_VALUES:
+            raise Unreadable(f"claims {w} x {h} pixels of {spec.nchannels} channels: too many")
     first, count = _channels(list(spec.channelnames))
     factor = max(1, math.isqrt(width * height // max_pixels))
     while -(-width // factor) * -(-height // factor) > max_pixels:
@@ -142,39 +152,84 @@ def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: 
     # 8-bit values are decoded by a table of 256 entries.
     table = None if decode is None else decode(np.arange(256) / 255.0).astype(np.float32)
     pixels = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
-    tile = int(spec.tile_height) or 1
-    step = math.lcm(factor, tile)  # a band holds whole rows of the result and whole tiles
-    rows = step * max(1, _VALUES_PER_BAND // (width * count * step))
-    for top in range(0, height, rows):
-        bottom = min(top + rows, height)
-        y0, y1, kind = spec.y + top, spec.y + bottom, oiio.UINT8 if is_uint8 else oiio.FLOAT
+    step = math.lcm(factor, int(spec.tile_height) or 1)  # a band holds whole tiles, and mostly whole rows of the result
+    rows = step * max(1, _VALUES_PER_BAND // (spec.width * count * step))
+    x0, x1 = max(left, spec.x), min(left + width, spec.x + spec.width)
+    for above in range(spec.y, spec.y + spec.height, rows):
+        below = min(above + rows, spec.y + spec.height)
+        y0, y1 = max(top, above), min(top + height, below)
+        if x0 >= x1 or y0 >= y1:
+            continue  # the band is outside the display window
+        kind = oiio.UINT8 if is_uint8 else oiio.FLOAT
         if spec.tile_width:
-            band = reader.read_tiles(0, 0, spec.x, spec.x + width, y0, y1, 0, 1, first, first + count, kind)
+            band = reader.read_tiles(
+                part, 0, spec.x, spec.x + spec.width, above, below, 0, 1, first, first + count, kind
+            )
         else:
-            band = reader.read_scanlines(0, 0, y0, y1, 0, first, first + count, kind)
+            band = reader.read_scanlines(part, 0, above, below, 0, first, first + count, kind)
         if band is None:
-            raise Unreadable(f"cannot be read: {_first_line(reader.geterror(), path)}")
-        stored = np.asarray(band).reshape(bottom - top, width, count)
-        values = stored.astype(np.float32) / np.float32(255.0 if is_uint8 else 1.0)
+            raise Unreadable(f"cannot be read: {_without_path(oiio_error(reader), path)}")
+        stored = np.asarray(band).reshape(below - above, spec.width, count)
+        stored = stored[y0 - above : y1 - above, x0 - spec.x : x1 - spec.x]
+        values = stored.astype(np.float32) / np.float32(255.0) if is_uint8 else stored.astype(np.float32)
         if decode is not None and table is not None:
             values[..., :colors] = table[stored[..., :colors]] if is_uint8 else decode(values[..., :colors])
-        pixels[top // factor : -(-bottom // factor)] = _averaged(values, factor)
+        _add_means(pixels, values, (y0 - top, x0 - left), (height, width), factor)
     if not np.isfinite(pixels).all():
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
     return Image(pixels, width, height, decode is not None, _wrap_modes(spec))
 
 
-def _averaged(values: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:
-    """Means of blocks of factor x factor pixels; blocks at the right and bottom edges may be smaller."""
+def _select_part(reader: "oiio.ImageInput") -> int:
+    """Selects the part of a multi-part EXR that holds colour, else grey, else the first; returns its number."""
+    if reader.format_name() != "openexr":
+        return 0
+    parts: list[set[str]] = []
+    while reader.seek_subimage(len(parts), 0):
+        spec = reader.spec()
+        parts.append(set() if spec.deep else set(spec.channelnames))
+    oiio_error(reader)  # clears the error of seeking past the last part
+    colors: tuple[set[str], ...] = ({"R", "G", "B"}, {"Y"})
+    part = next((k for wanted in colors for k, names in enumerate(parts) if wanted <= names), 0)
+    reader.seek_subimage(part, 0)
+    return part
+
+
+def _display_window(reader: "oiio.ImageInput") -> tuple[int, int, int, int]:
+    """Left column, top row, width and height of the display window; that of the data in formats without one."""
+    spec = reader.spec()
+    if reader.format_name() in _WINDOWED_FORMATS and min(spec.full_width, spec.full_height) > 0:
+        return spec.full_x, spec.full_y, spec.full_width, spec.full_height
+    return spec.x, spec.y, spec.width, spec.height
+
+
+def _add_means(
+    pixels: npt.NDArray[np.float32],
+    values: npt.NDArray[np.float32],
+    start: tuple[int, int],
+    size: tuple[int, int],
+    factor: int,
+) -> None:
+    """Adds values to the means over blocks of factor x factor pixels; blocks at the right and bottom may be smaller.
+
+    Args:
+        pixels: The means, [h, w, c].
+        values: A part of the image.
+        start: Row and column of the part in the image.
+        size: Height and width of the image.
+        factor: Height and width of a block.
+    """
+    blocks, starts, counts = [], [], []
+    for axis in (0, 1):
+        block = np.arange(start[axis] // factor, -(-(start[axis] + values.shape[axis]) // factor))
+        blocks.append(slice(block[0], block[-1] + 1))
+        starts.append(np.maximum(block * factor - start[axis], 0))
+        counts.append(np.minimum((block + 1) * factor, size[axis]) - block * factor)
     if factor == 1:
-        return values
-    down = np.arange(0, values.shape[0], factor)
-    across = np.arange(0, values.shape[1], factor)
-    sums = np.add.reduceat(np.add.reduceat(values, down, axis=0, dtype=np.float64), across, axis=1)
-    counts = np.minimum(down + factor, values.shape[0]) - down
-    widths = np.minimum(across + factor, values.shape[1]) - across
-    means: npt.NDArray[np.float32] = (sums / (counts[:, None] * widths)[..., None]).astype(np.float32)
-    return means
+        pixels[blocks[0], blocks[1]] = values
+        return
+    sums = np.add.reduceat(np.add.reduceat(values, starts[0], axis=0, dtype=np.float64), starts[1], axis=1)
+    pixels[blocks[0], blocks[1]] += (sums / (counts[0][:, None] * counts[1])[..., None]).astype(np.float32)
 
 
 def _channels(names: list[str]) -> tuple[int, int]:
@@ -207,6 +262,5 @@ def _short(path: str) -> str:
     return path if len(path) <= 120 else f"…{path[-119:]}"
 
 
-def _first_line(text: str, path: str) -> str:
-    lines = text.replace(path, "it").strip().splitlines()
-    return lines[0].strip() if lines else "unknown error"
+def _without_path(text: str, path: str) -> str:
+    return text.replace(path, "it") or "unknown error"

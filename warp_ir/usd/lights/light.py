@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
 
-from warp_ir.scene import Color, Floats, Light, LightKind
+from warp_ir.scene import MAX_RADIANCE, Color, Floats, Light, LightKind
 from warp_ir.usd.images.asset import read_texture
 from warp_ir.usd.images.cache import inherited_color_space
 from warp_ir.usd.images.latlong import LAYOUTS, to_latlong
@@ -34,8 +34,6 @@ LIGHTS = {
 }
 """The light schemas that are read, by their kind."""
 
-MAX_RADIANCE = 1e30
-"""Upper limit of radiance; larger values are errors in the file, and overflow float32 when squared or summed."""
 _DELTA_ANGLE = 1e-5
 """Full angle [degrees] of a distant light below which it is a delta light."""
 _LINE_RADIUS = 1e-4
@@ -110,6 +108,7 @@ class _LightBuilder:
     def __init__(self, inputs: LightInputs, light: Light, radiance: Floats) -> None:
         self._inputs, self._light, self._radiance = inputs, light, radiance
         prim, time, kind = inputs.prim, inputs.time, light.kind
+        self._brightest = 1.0 if light.texture is None else max(float(light.texture.max()), 1.0)
         self._size = {
             name: abs(inputs.number(name, default)) for name, default in _DEFAULT_DIMENSIONS.get(kind, {}).items()
         }
@@ -121,12 +120,17 @@ class _LightBuilder:
     def at(self, matrix: Floats) -> Light | None:
         """The light with a transform world_from_light, [4, 4]; None: it emits nothing."""
         light = replace(self._light, world_from_light=matrix)
+        placed: Light | None = light
         if light.kind == LightKind.DOME:
             pole = _dome_from_pole(self._inputs)
-            return light if light.texture is None else replace(light, world_from_light=matrix @ pole)
-        if light.kind == LightKind.DISTANT:
-            return self._distant(light)
-        return self._area_light(light)
+            placed = light if light.texture is None else replace(light, world_from_light=matrix @ pole)
+        elif light.kind == LightKind.DISTANT:
+            placed = self._distant(light)
+        else:
+            placed = self._area_light(light)
+        if placed is not None:
+            checked_radiance(np.array(placed.radiance) * self._brightest)
+        return placed
 
     def _distant(self, light: Light) -> Light:
         """A distant light, normalised by its projected solid angle."""

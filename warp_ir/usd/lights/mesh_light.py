@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from warp_ir.scene import Floats, LightKind, Material, MeshLight, Shaping, Texture
+from warp_ir.scene import MAX_RADIANCE, Floats, LightKind, Material, MeshLight, Shaping, Texture
 from warp_ir.usd.lights.inputs import LightInputs
 from warp_ir.usd.lights.light import (
     checked_radiance,
@@ -120,9 +120,20 @@ class MeshLightPrim:
                 what = "texture:file is ignored, since the material's emission has a texture"
                 self._report.warn(self._prim.GetPath(), what)
             adjusted.append(_with_scaled_emission(material, radiance))
+        if not all(_brightest(material) < MAX_RADIANCE for material in adjusted):
+            what = f"its emission exceeds {MAX_RADIANCE:g}; it does not emit as a light"
+            self._report.warn(self._prim.GetPath(), what)
+            return list(materials)
         return adjusted
 
 
+def _brightest(material: Material) -> float:
+    """The largest emission of a material."""
+    texture = material.emission_texture
+    return max(material.emission) if texture is None else max(float(texture.pixels.max()), *texture.outside)
+
+
+@np.errstate(over="ignore")
 def _with_scaled_emission(material: Material, factor: Floats) -> Material:
     """The material with its emission scaled by a factor, float64 [3]."""
     texture = material.emission_texture

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from warp_ir.scene import Bools, Floats, Ints, Material
+from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue
-from warp_ir.usd.lights.light import MAX_RADIANCE
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
 from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_material
 from warp_ir.usd.values import primvar, read

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.scene import Color, Floats, Material, Wrap
+from warp_ir.scene import MAX_RADIANCE, Color, Floats, Material, Wrap
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, as_color, combine, constant
-from warp_ir.usd.lights.light import MAX_RADIANCE
 from warp_ir.usd.shading.network import ShadingNetwork
 from warp_ir.usd.shading.vendor_shaders import shader_name, vendor_reader
 from warp_ir.usd.values import read
@@ -58,10 +57,15 @@ def read_material(
     """
     path = material.GetPath()
     outputs = [str(o.GetFullName()) for o in material.GetSurfaceOutputs() if o.HasConnectedSource()]
-    # The universal render context first: others are used only if its shader is not supported.
-    contexts = dict.fromkeys(["", "mtlx", *(name.removeprefix("outputs:").rpartition(":")[0] for name in outputs)])
-    sources = [source for context in contexts if (source := material.ComputeSurfaceSource(context)[0])]
-    shaders = list({source.GetPath(): UsdShade.Shader(source) for source in sources}.values())
+    # MaterialX before the universal render context, as in Storm; others are used only if neither shader is supported.
+    contexts = dict.fromkeys(["mtlx", "", *(name.removeprefix("outputs:").rpartition(":")[0] for name in outputs)])
+    by_context = {context: source for context in contexts if (source := material.ComputeSurfaceSource(context)[0])}
+    shaders = list({source.GetPath(): UsdShade.Shader(source) for source in by_context.values()}.values())
+    choice = {
+        by_context[context].GetPath(): output
+        for context, output in (("", "outputs:surface"), ("mtlx", "outputs:mtlx:surface"))
+        if context in by_context
+    }
     surface_paths = {shader.GetPath() for shader in shaders}
     displacements = [material.ComputeDisplacementSource(context)[0] for context in contexts]
     if any(source and source.GetPath() not in surface_paths for source in displacements):
@@ -72,6 +76,9 @@ def read_material(
     for shader, shader_inputs in zip(shaders, inputs, strict=True):
         read_shader = _SHADER_READERS.get(shader.GetShaderId())
         if read_shader is not None:
+            if len(choice) > 1 and shader.GetPath() in choice:
+                output = choice[shader.GetPath()]
+                shader_inputs.warn(f"of its MaterialX and its universal surface, {output} is used ({{n}} materials)")
             return read_shader(shader_inputs)
     for shader, shader_inputs in zip(shaders, inputs, strict=True):
         read_parameters = vendor_reader(shader)

@@ -6,9 +6,9 @@ them, upgrades old versions and knows the definition of each node.
 """
 
 import os
+import re
 from functools import lru_cache
 from typing import TYPE_CHECKING
-from xml.parsers import expat
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdShade
@@ -25,6 +25,11 @@ _MAX_DEPTH = 64
 """Maximum nesting depth of elements: the library's parser is recursive."""
 _MAX_PRIMS = 20_000
 """Maximum number of nodes over all materials: each material has copies of the nodes that it uses."""
+_SKIPPED = ((b"<!--", b"-->"), (b"<![CDATA[", b"]]>"), (b"<?", b"?>"))
+"""Begin and end of markup without elements."""
+_QUOTE_OR_END = re.compile(rb"[\"'>]")
+_DOCTYPE_MARKUP = re.compile(rb"\"[^\"]*\"|'[^']*'|<\?.*?\?>|<!--.*?-->|<!|>", re.DOTALL)
+"""What counts in a document type declaration: quoted text, instructions and comments, then begin and end of groups."""
 _TYPES = {
     "float": Sdf.ValueTypeNames.Float,
     "integer": Sdf.ValueTypeNames.Int,
@@ -61,7 +66,7 @@ def materialx_layer(source: str) -> tuple[Sdf.Layer, list[str]]:
         Unreadable: The file is missing, not a MaterialX document, or too large or deep.
     """
     content = _content(source)
-    includes = _check_xml(content)
+    includes = _check_size(content)
     document = _document(content)
     layer = Sdf.Layer.CreateAnonymous(f"{os.path.basename(source)}.usda")
     writer = _Writer(Usd.Stage.Open(layer), document, Ar.ResolvedPath(source))
@@ -83,38 +88,63 @@ def _content(source: str) -> bytes:
         raise Unreadable("not found")
     if asset.GetSize() > _MAX_BYTES:
         raise Unreadable(f"{asset.GetSize()} bytes; the limit is {_MAX_BYTES}")
-    return bytes(asset.GetBuffer() or b"")
+    return bytes(asset.GetBuffer() or b"").partition(b"\0")[0]  # the library's parser ends there
 
 
-def _check_xml(content: bytes) -> bool:
-    """Checks that a document is XML without entities, of limited size and depth; returns whether it includes others.
+def _check_size(content: bytes) -> bool:
+    """Checks that a document has a limited number and depth of elements; returns whether it includes others.
+
+    It follows the library's parser, pugixml, which accepts more than XML allows: blanks or text before the
+    declaration, or `&` and `<` in attributes. It expands no entities. What it refuses may have any depth here.
 
     Raises:
-        Unreadable: It is not.
+        Unreadable: It has too many elements, they are nested too deeply, or a tag has no end.
     """
-    open_elements, elements, includes = 0, 0, False
-
-    def start(name: str, _attributes: dict[str, str]) -> None:
-        nonlocal open_elements, elements, includes
-        open_elements, elements, includes = open_elements + 1, elements + 1, includes or name == "xi:include"
-        if open_elements > _MAX_DEPTH or elements > _MAX_ELEMENTS:
-            raise Unreadable("it has too many elements, or they are nested too deeply")
-
-    def end(_name: str) -> None:
-        nonlocal open_elements
-        open_elements -= 1
-
-    def declared(*_: object) -> None:
-        raise Unreadable("it declares a document type, which is not allowed")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = declared
-    try:
-        parser.Parse(content, True)
-    except (expat.ExpatError, ValueError, LookupError) as error:
-        raise Unreadable(f"no XML: {error}") from None
+    depth, elements, includes, at = 0, 0, False, content.find(b"<")
+    while at >= 0:
+        if content.startswith(b"<!DOCTYPE", at):
+            at = _doctype_end(content, at + 9)
+        elif (end := next((end for start, end in _SKIPPED if content.startswith(start, at)), b"")) != b"":
+            at = _after(content, end, at)
+        elif content.startswith(b"</", at):
+            depth, at = depth - 1, _after(content, b">", at)
+        else:
+            start, at = at, _tag_end(content, at)
+            depth, elements = depth + (content[at - 2 : at] != b"/>"), elements + 1
+            includes = includes or content.startswith(b"<xi:include", start)
+            if depth > _MAX_DEPTH or elements > _MAX_ELEMENTS:
+                raise Unreadable("it has too many elements, or they are nested too deeply")
+        at = content.find(b"<", at)
     return includes
+
+
+def _after(content: bytes, what: bytes, at: int) -> int:
+    """The position after the next occurrence of some bytes."""
+    found = content.find(what, at)
+    if found < 0:
+        raise Unreadable("no XML: a tag has no end")
+    return found + len(what)
+
+
+def _tag_end(content: bytes, at: int) -> int:
+    """The position after a start tag; `>` in a quoted value does not end it."""
+    while True:
+        found = _QUOTE_OR_END.search(content, at)
+        if found is None:
+            raise Unreadable("no XML: a tag has no end")
+        if found[0] == b">":
+            return found.end()
+        at = _after(content, found[0], found.end())
+
+
+def _doctype_end(content: bytes, at: int) -> int:
+    """The position after a document type declaration, whose markup is skipped."""
+    depth = 0
+    for found in _DOCTYPE_MARKUP.finditer(content, at):
+        depth += {b"<!": 1, b">": -1}.get(found[0], 0)
+        if depth < 0:
+            return found.end()
+    raise Unreadable("no XML: its document type declaration has no end")
 
 
 def _document(content: bytes) -> "MaterialX.Document":
