@@ -1,8 +1,8 @@
 """Ray–triangle intersection.
 
-On CUDA this is Warp's own mesh query. On the CPU, where that query is scalar code on a binary tree, the same tree is
-collapsed to nodes of eight children and leaves of eight triangles, which a ray tests eight at a time in vector
-registers (Wald, Benthin and Boulos 2008: "Getting Rid of Packets").
+On CUDA rays traverse the binary tree of a Warp mesh. On the CPU the same tree is collapsed to nodes of eight children
+and leaves of eight triangles, which a ray tests eight at a time in vector registers (Wald, Benthin and Boulos 2008:
+"Getting Rid of Packets"). Both are watertight.
 
 Instanced prototypes are stored once: a second BVH, over the boxes of the instances, leads rays into the prototype's
 BVH, where they are traced in the prototype's space.

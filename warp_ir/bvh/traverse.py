@@ -18,6 +18,7 @@ from warp_ir.bvh.intersect8 import (
     safe_reciprocal,
 )
 from warp_ir.bvh.node_layout import Bvh, InstanceTree, RayHit, TwoLevel, vec8, vec8i
+from warp_ir.bvh.warp_bvh import intersect_mesh
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,6 +54,40 @@ def _push_children(
     return depth
 
 
+@wp.func
+def _axes(direction: wp.vec3) -> wp.vec3i:
+    """The axes, permuted so that the last is the largest component of the direction; the winding is preserved."""
+    z = int(0)
+    if wp.abs(direction[1]) > wp.abs(direction[0]):
+        z = 1
+    if wp.abs(direction[2]) > wp.abs(direction[z]):
+        z = 2
+    if direction[z] < 0.0:
+        return wp.vec3i((z + 2) % 3, (z + 1) % 3, z)
+    return wp.vec3i((z + 1) % 3, (z + 2) % 3, z)
+
+
+@wp.func(inline=False)
+def traverse_mesh(
+    mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, any_hit: bool, error: wp.vec3
+) -> RayHit:
+    """The traversal on CUDA: the closest triangle of a `wp.Mesh`."""
+    hit = RayHit()
+    hit.instance = -1
+    axes = _axes(direction)
+    inverse = safe_reciprocal(direction)
+    closest = intersect_mesh(mesh, origin, direction, inverse, axes[0], axes[1], axes[2], t_max, any_hit, error)
+    code = wp.int64(closest[0])
+    hit.triangle = -1
+    if code >= wp.int64(0):
+        hit.triangle = int(code >> wp.int64(1))
+        hit.front = int(code & wp.int64(1))
+    hit.t = float(closest[1])
+    hit.u = float(closest[2])
+    hit.v = float(closest[3])
+    return hit
+
+
 def _make_traversal(name: str, padded: bool) -> Callable[..., RayHit]:
     """Makes the function that traces a ray through one tree, with padded boxes and triangles if `padded`."""
 
@@ -70,17 +105,10 @@ def _make_traversal(name: str, padded: bool) -> Callable[..., RayHit]:
         near_y = wp.where(inverse[1] < 0.0, 4, 1)
         near_z = wp.where(inverse[2] < 0.0, 5, 2)
 
-        # Permutes the axes so that z is the largest component of the direction; the winding is preserved.
-        z = int(0)
-        if wp.abs(direction[1]) > wp.abs(direction[0]):
-            z = 1
-        if wp.abs(direction[2]) > wp.abs(direction[z]):
-            z = 2
-        x = (z + 1) % 3
-        y = (z + 2) % 3
-        if direction[z] < 0.0:
-            x = (z + 2) % 3
-            y = (z + 1) % 3
+        axes = _axes(direction)
+        x = axes[0]
+        y = axes[1]
+        z = axes[2]
         shear = wp.vec3(direction[x], direction[y], 1.0) / direction[z]
         o = wp.vec3(origin[x], origin[y], origin[z])
 
@@ -179,23 +207,8 @@ def _make_traversal(name: str, padded: bool) -> Callable[..., RayHit]:
 
         `error` bounds the rounding error of the ray in each axis; only a padded traversal reads it.
         """
-        hit = RayHit()
-        hit.triangle = -1
-        hit.instance = -1
-        hit.t = t_max
         if on_cuda():
-            if any_hit:
-                if wp.mesh_query_ray_anyhit(mesh, origin, direction, t_max):
-                    hit.triangle = 0
-            else:
-                query = wp.mesh_query_ray(mesh, origin, direction, t_max)
-                if query.result:
-                    hit.triangle = query.face
-                    hit.t = query.t
-                    hit.u = query.u
-                    hit.v = query.v
-                    hit.front = wp.where(wp.dot(query.normal, direction) < 0.0, 1, 0)
-            return hit
+            return traverse_mesh(mesh, origin, direction, t_max, any_hit, error)
         return traverse_cpu(bvh, root, origin, direction, t_max, any_hit, error)
 
     return traverse

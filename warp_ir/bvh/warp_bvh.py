@@ -1,4 +1,4 @@
-"""Access to the nodes of the binary BVHs that Warp builds (`wp::BVH` in Warp's bvh.h)."""
+"""Access to the nodes of the binary BVHs that Warp builds (`wp::BVH` in Warp's bvh.h), and rays through them."""
 
 import warp as wp
 
@@ -51,4 +51,106 @@ def root_node(tree: wp.uint64) -> int:
 @wp.func_native("return ((const wp::BVH*)tree)->num_nodes;")
 def node_count(tree: wp.uint64) -> int:
     """The number of nodes."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const auto product = [](float a, float b) { return __fmul_rn(a, b); };
+    const auto difference = [](float a, float b) { return __fsub_rn(a, b); };
+#else
+    #pragma clang fp contract(off)
+    const auto product = [](float a, float b) { return a * b; };
+    const auto difference = [](float a, float b) { return a - b; };
+#endif
+    const wp::Mesh& triangles = *(const wp::Mesh*)mesh;
+    const wp::BVH& bvh = triangles.bvh;
+    const float sx = direction[x] / direction[z], sy = direction[y] / direction[z], sz = 1.0f / direction[z];
+    const float pad_x = error[x] + fabsf(sx) * error[z], pad_y = error[y] + fabsf(sy) * error[z];
+    wp::vec_t<4, double> hit(-1.0, t_max, 0.0, 0.0);
+    // Warp's trees have at most 32 levels.
+    int stack[34];
+    float stack_t[34];
+    stack[0] = *bvh.root;
+    stack_t[0] = 0.0f;
+    int depth = 1;
+    while (depth > 0) {
+        const int node = stack[--depth];
+        if (stack_t[depth] >= t_max) continue;
+        const wp::BVHPackedNodeHalf first = bvh.node_lowers[node], second = bvh.node_uppers[node];
+        if (first.b) {
+            for (int i = first.i; i < (int)second.i; ++i) {
+                const int triangle = bvh.primitive_indices[i];
+                float px[3], py[3], pz[3];
+                for (int k = 0; k < 3; ++k) {
+                    const wp::vec3& corner = triangles.points[triangles.indices[3 * triangle + k]];
+                    pz[k] = difference(corner[z], origin[z]);
+                    px[k] = difference(difference(corner[x], origin[x]), product(sx, pz[k]));
+                    py[k] = difference(difference(corner[y], origin[y]), product(sy, pz[k]));
+                }
+                const float u = difference(product(px[2], py[1]), product(py[2], px[1]));
+                const float v = difference(product(px[0], py[2]), product(py[0], px[2]));
+                const float w = difference(product(px[1], py[0]), product(py[1], px[0]));
+                const float eu = fabsf(py[1] - py[2]) * pad_x + fabsf(px[1] - px[2]) * pad_y;
+                const float ev = fabsf(py[2] - py[0]) * pad_x + fabsf(px[2] - px[0]) * pad_y;
+                const float ew = fabsf(py[0] - py[1]) * pad_x + fabsf(px[0] - px[1]) * pad_y;
+                const bool inside = ((u >= -eu) & (v >= -ev) & (w >= -ew)) | ((u <= eu) & (v <= ev) & (w <= ew));
+                const float determinant = u + v + w;
+                const float t = sz * (u * pz[0] + v * pz[1] + w * pz[2]) / determinant;
+                if (inside && determinant != 0.0f && t >= 0.0f && t < t_max) {
+                    t_max = t;
+                    hit = wp::vec_t<4, double>(determinant > 0.0f ? 2.0 * triangle + 1.0 : 2.0 * triangle, t,
+                                               u / determinant, v / determinant);
+                    if (any_hit) return hit;
+                }
+            }
+        } else {
+            const int children[2] = {(int)first.i, (int)second.i};
+            float t[2];
+            for (int k = 0; k < 2; ++k) {
+                const wp::BVHPackedNodeHalf lower = bvh.node_lowers[children[k]], upper = bvh.node_uppers[children[k]];
+                const float low[3] = {lower.x, lower.y, lower.z}, high[3] = {upper.x, upper.y, upper.z};
+                float near = 0.0f, far = 3.0e38f;
+                for (int axis = 0; axis < 3; ++axis) {
+                    const float padding = error[axis];
+                    const float a = (low[axis] - padding - origin[axis]) * inverse[axis];
+                    const float b = (high[axis] + padding - origin[axis]) * inverse[axis];
+                    near = wp::max(near, wp::min(a, b));
+                    far = wp::min(far, wp::max(a, b));
+                }
+                t[k] = near <= far * 1.0000004f ? near : 3.0e38f;
+            }
+            const int nearer = t[1] < t[0] ? 1 : 0;
+            for (int k = 1; k >= 0; --k) {
+                const int child = k ^ nearer;
+                if (t[child] < t_max) {
+                    stack[depth] = children[child];
+                    stack_t[depth++] = t[child];
+                }
+            }
+        }
+    }
+    return hit;
+""")
+def intersect_mesh(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    inverse: wp.vec3,
+    x: int,
+    y: int,
+    z: int,
+    t_max: float,
+    any_hit: bool,
+    error: wp.vec3,
+) -> wp.vec4d:
+    """The closest triangle of a `wp.Mesh` before t_max, tested as in `intersect8.py`: Warp's own query leaks at edges.
+
+    x, y and z permute the axes so that z is the direction's largest, and preserve the winding; `inverse` is 1 /
+    direction; boxes and triangles are padded by `error`. Products and differences are not contracted on CUDA either.
+
+    Returns:
+        2 · triangle + (1 if the ray hits its front), t, and the barycentric weights of the first two corners; -1 first
+        if there is none. float64 holds every triangle's number.
+    """
     ...

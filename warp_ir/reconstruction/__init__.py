@@ -10,18 +10,18 @@ With defocus or motion blur, samples are reprojected through the centre of the l
 (`blur.py`).
 
 Where the picture differs from the unfiltered mean by more than noise explains, the mean wins: the bias of the filter
-vanishes with the noise. On edges, the difference is shrunk by its noise (James and Stein 1961) and added
-(`compose.py`).
+vanishes with the noise (`compose.py`). On edges, the difference is shrunk by its noise (James and Stein 1961) and
+added; a local gain gives the picture the level of the mean from the first iteration on (`correct.py`).
 """
 
-from warp_ir.reconstruction import blur, compose, filter, sample_buffer
+from warp_ir.reconstruction import blur, correct, filter, sample_buffer
 from warp_ir.reconstruction.reconstruct import SCRATCH, Reconstruction
 from warp_ir.reconstruction.reprojection import surfaces_move
 
 FILTER_MODULES = (
     sample_buffer,
     filter,
-    compose,
+    correct,
 )
 """Modules with the kernels of the filter."""
 BLUR_MODULES = (blur,)

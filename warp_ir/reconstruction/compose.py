@@ -1,7 +1,7 @@
-"""The picture from filtered irradiance: with supersampled edges, and corrected towards the unfiltered mean.
+"""The picture from filtered irradiance, with supersampled edges.
 
 Away from edges, a pixel whose filtered value differs from the unfiltered mean by more standard errors than noise
-explains takes the mean. On edges, the difference is shrunk by its noise (James and Stein 1961) and added.
+explains takes the mean.
 """
 
 import numpy as np
@@ -13,14 +13,12 @@ from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.film.accumulate import FilmData, emission_of
 from warp_ir.reconstruction.edges import SupersampledPixel, WeightedIrradiance, on_edge, supersample_edge
 from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels, rgb
-from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
 from warp_ir.reconstruction.sample_buffer import SampleBuffer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _MAX_EDGE_RAYS = 256
 _MAX_STANDARD_ERRORS = wp.constant(8.0)  # by which the filtered value may differ from the mean, away from edges
-_RADIUS = wp.constant(2)  # of the window over which the noise of differences on edges is estimated [pixels]
 
 
 @wp.struct
@@ -167,35 +165,6 @@ def _compose(
     store_pixel(out, p, x)
 
 
-@wp.kernel
-def _correct_edges(first: int, surfaces: PixelSurfaces, out: ResolvedPicture) -> None:
-    """Adds to pixels on edges the part of the residual that is not noise (James and Stein 1961).
-
-    The residuals of neighbouring pixels are pooled: if their mean square is r times what noise explains, the fraction
-    1 - 1/r of the residual is bias.
-    """
-    p = first + wp.tid()
-    if out.edge_residual.direct[p][3] >= 0.0:
-        ratio = wp.vec2(0.0)
-        weights = float(0.0)
-        for dy in range(-_RADIUS, _RADIUS + 1):
-            for dx in range(-_RADIUS, _RADIUS + 1):
-                x = p % surfaces.columns + dx
-                y = p // surfaces.columns + dy
-                if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                    d = out.edge_residual.direct[y * surfaces.columns + x]
-                    if d[3] >= 0.0:
-                        i = out.edge_residual.indirect[y * surfaces.columns + x]
-                        means = mean_channels(rgb(d), rgb(i))
-                        w = 1.0 / (1.0 + 0.5 * float(dx * dx + dy * dy))
-                        ratio += w * wp.cw_div(wp.cw_mul(means, means), wp.vec2(d[3], i[3]) + wp.vec2(1.0e-30))
-                        weights += w
-        d = out.edge_residual.direct[p]
-        i = out.edge_residual.indirect[p]
-        out.rows[0, p] = out.rows[0, p] + rgb(d) * wp.max(1.0 - weights / (ratio[0] + 1.0e-30), 0.0)
-        out.rows[1, p] = out.rows[1, p] + rgb(i) * wp.max(1.0 - weights / (ratio[1] + 1.0e-30), 0.0)
-
-
 def edge_rays(iterations: int) -> int:
     """Maximum number of camera rays through a pixel on an edge: the error of the edge is then below the noise."""
     return min(16 + 2 * iterations, _MAX_EDGE_RAYS)
@@ -224,11 +193,6 @@ def compose(
 ) -> None:
     """Fills a `ResolvedPicture` from a filtered `IrradianceLayer`."""
     launcher.launch(_compose, camera.columns * camera.rows, [scene.data, camera, samples, layer, film, exposure, out])
-
-
-def correct_edges(surfaces: PixelSurfaces, out: ResolvedPicture, launcher: Launcher) -> None:
-    """Adds the bias of the pixels on edges to a `ResolvedPicture`."""
-    launcher.launch(_correct_edges, surfaces.columns * surfaces.rows, [surfaces, out])
 
 
 def rows_to_host(out: ResolvedPicture) -> npt.NDArray[np.float32]:

@@ -3,13 +3,13 @@
 An edge-avoiding à-trous wavelet filter (Dammertz et al. 2010) guided by measured variance (Schied et al. 2017). Direct
 and indirect irradiance are filtered separately: direct light has sharp shadows, indirect light hardly any. A
 neighbour's weight is high if it lies on the same surface and differs by no more than the noise explains: the bias of
-the filter vanishes with the noise.
+the filter vanishes with the noise. Weights are symmetric and a pixel keeps the rest, so no light is lost.
 """
 
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces, match_weights
+from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces, pixel_match_weights
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -50,26 +50,37 @@ def rgb(row: wp.vec4) -> wp.vec3:
 
 @wp.func
 def _tap_weight(k: int) -> float:
-    """The three middle taps, -1 to 1, of the B3 spline; the outer two cost more time than they remove noise."""
-    return wp.where(k == 0, 0.375, 0.25)
+    """The three middle taps, -1 to 1, of the B3 spline, over their sum; the outer two cost more than they remove."""
+    return wp.where(k == 0, 3.0 / 7.0, 2.0 / 7.0)
 
 
 @wp.func
 def _similarity(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
-    """Weight in [0, 1] of a neighbour's value `b`, by its difference from `a` in units of the noise of `a`.
+    """Weight in [0, 1] of two values, by their difference in units of their noise; the same for (b, a).
 
-    Since the noise is that of `a`, an outlier is replaced by its neighbours and does not spread to them.
+    Noise is the harmonic mean of both variances. By that of `a` alone the picture would darken: what is dim by chance
+    has little noise, and would take nothing from what is bright.
     """
     d = (a[0] + a[1] + a[2] - b[0] - b[1] - b[2]) * (1.0 / 3.0)
-    t = 1.0 + d * d / (2.0 * sigma * sigma * a[3] + 1.0e-30)
+    variance = a[3] * (b[3] / (a[3] + b[3] + 1.0e-30))
+    t = 1.0 + d * d / (4.0 * sigma * sigma * variance + 1.0e-30)
     return 1.0 / (t * t)
+
+
+@wp.func
+def _weighted(row: wp.vec4, weight: float) -> wp.vec4:
+    """A row times a weight, and its variance times the square."""
+    return wp.vec4(row[0] * weight, row[1] * weight, row[2] * weight, row[3] * weight * weight)
 
 
 @wp.kernel
 def _filter_level(
     first: int, surfaces: PixelSurfaces, source: IrradianceLayer, out: IrradianceLayer, step: int, sigmas: wp.vec2
 ) -> None:
-    """One level of 3 x 3 taps, `step` pixels apart."""
+    """One level of 3 x 3 taps, `step` pixels apart.
+
+    Two pixels exchange light by one weight, and a pixel keeps what it does not exchange: the sum over a surface stays.
+    """
     p = first + wp.tid()
     own_direct = source.direct[p]
     own_indirect = source.indirect[p]
@@ -79,8 +90,6 @@ def _filter_level(
     direct = wp.vec4(0.0)
     indirect = wp.vec4(0.0)
     weights = wp.vec2(0.0)
-    position = surfaces.position[p]
-    normal = surfaces.normal[p]
     for dy in range(-1, 2):
         y = row + dy * step
         if y >= 0 and y < surfaces.rows:
@@ -92,18 +101,18 @@ def _filter_level(
                     if d[3] >= 0.0:
                         i = source.indirect[q]
                         w = _tap_weight(dx) * _tap_weight(dy)
-                        a = w
-                        b = w
                         if q != p:
-                            match = match_weights(surfaces, q, position, normal)
-                            a = w * match[0]
-                            b = w * match[1]
+                            match = w * pixel_match_weights(surfaces, p, q)
                             if has_value:
-                                a *= _similarity(own_direct, d, sigmas[0])
-                                b *= _similarity(own_indirect, i, sigmas[1])
-                        direct += wp.vec4(d[0] * a, d[1] * a, d[2] * a, d[3] * a * a)
-                        indirect += wp.vec4(i[0] * b, i[1] * b, i[2] * b, i[3] * b * b)
-                        weights += wp.vec2(a, b)
+                                match[0] *= _similarity(own_direct, d, sigmas[0])
+                                match[1] *= _similarity(own_indirect, i, sigmas[1])
+                            direct += _weighted(d, match[0])
+                            indirect += _weighted(i, match[1])
+                            weights += match
+    if has_value:
+        direct += _weighted(own_direct, 1.0 - weights[0])
+        indirect += _weighted(own_indirect, 1.0 - weights[1])
+        weights = wp.vec2(1.0)
     out.direct[p] = _normalized(direct, weights[0])
     out.indirect[p] = _normalized(indirect, weights[1])
 

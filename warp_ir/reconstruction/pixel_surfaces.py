@@ -35,7 +35,18 @@ def match_weights(surfaces: PixelSurfaces, p: int, position: wp.vec3, normal: wp
     They are 1 for a point in the pixel's tangent plane with the same normal. Indirect irradiance varies less with the
     normal, so its weight falls more slowly.
     """
-    footprint = surfaces.footprint[p]
+    return _match_weights(surfaces, p, surfaces.footprint[p], position, normal)
+
+
+@wp.func
+def pixel_match_weights(surfaces: PixelSurfaces, p: int, q: int) -> wp.vec2:
+    """As `match_weights`, of two pixels: the same for (p, q) as for (q, p)."""
+    footprint = wp.min(surfaces.footprint[p], surfaces.footprint[q])
+    return _match_weights(surfaces, p, footprint, surfaces.position[q], surfaces.normal[q])
+
+
+@wp.func
+def _match_weights(surfaces: PixelSurfaces, p: int, footprint: float, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
     if footprint <= 0.0:
         return wp.vec2(0.0)
     pixel_normal = surfaces.normal[p]

@@ -13,7 +13,8 @@ from warp_ir.device.scratch import Scratch
 from warp_ir.film.accumulate import FilmData
 from warp_ir.gbuffer import GBuffer
 from warp_ir.reconstruction.blur import blur_rays, compose_blurred
-from warp_ir.reconstruction.compose import compose, correct_edges, edge_rays, new_resolved_picture, rows_to_host
+from warp_ir.reconstruction.compose import compose, edge_rays, new_resolved_picture, rows_to_host
+from warp_ir.reconstruction.correct import correct
 from warp_ir.reconstruction.filter import filter_layer, new_layer
 from warp_ir.reconstruction.reprojection import (
     ShutterSample,
@@ -111,5 +112,5 @@ class Reconstruction:
                 compose_blurred(self._shutter, samples, layer, film, self._exposure, out, launcher)
             else:
                 compose(self._scene, camera, samples, layer, film, self._exposure, out, launcher)
-            correct_edges(samples.surfaces, out, launcher)
+            correct(samples.surfaces, film, out, layer, launcher)
             return rows_to_host(out).reshape(-1, camera.rows, camera.columns, 3)
