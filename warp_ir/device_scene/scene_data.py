@@ -77,12 +77,15 @@ class SceneData:
     radius: float
 
     emitter_count: int
-    emitter_cdf: wp.array[wp.float32]  # [emitters + 1], from 0 to 1; selection probabilities are proportional to power
+    # [emitters + 1], from 0 to 1, of the selection probabilities: by power, above a floor
+    emitter_cdf: wp.array[wp.float32]
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
     emitter_pdf_area: wp.array[wp.float32]  # [emitters], selection probability / area; 0 for emitters without area
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or of the triangle tables
     triangle_emitter: wp.array[wp.int32]  # [m], row of the emitter tables or -1; one row if no material emits
 
+    uneven: int  # 1: the powers of some sources differ by so much that `emitter_lift` is needed
+    emitter_lift: wp.array[wp.float32]  # [emitters], factor of the weights with which their VPLs are drawn; one row
     light_count: int  # analytic lights
     light_kind: wp.array[wp.int32]
     light_origin: wp.array[wp.vec3]

@@ -17,7 +17,7 @@ from warp_ir.device_scene.scene_data import SceneData
 from warp_ir.device_scene.validate import check_scene
 from warp_ir.sampling import sobol
 from warp_ir.sampling.distribution2d import Distribution2DList
-from warp_ir.scene import Floats, InputError, Scene, materials_of
+from warp_ir.scene import Floats, InputError, Ints, Scene, materials_of
 
 _TEXTURE_PATCHES = 2**14
 """Indirect light averages textures over this fraction of the scene's surface area: VPLs are not denser than that."""
@@ -44,6 +44,10 @@ class DeviceScene:
     """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
     source: Scene
     """The scene that was uploaded."""
+    emitter_power: Floats
+    """Estimated power of each emitter [emitters]."""
+    emitter_source: Ints
+    """The light, or part of a mesh, that each emitter belongs to [emitters]."""
     geometry: DeviceGeometry
     """Shared by all shutter samples, and passed on to the next upload."""
     geometry_version: int
@@ -130,7 +134,7 @@ def _upload(
         data.footprint = math.sqrt(area / _TEXTURE_PATCHES)
         geometry_owners = geometry.fill(k, data)
         first_triangles = geometry.first_triangles(k)
-        upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
+        power, source = upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
         data.sobol = launcher.array(sobol.sobol_matrices(), wp.uint32)
         on_device = launcher.empty(1, SceneData)
         data.address = wp.uint64(on_device.ptr)  # set in the copy as well: functions that read it pass it on
@@ -152,6 +156,8 @@ def _upload(
                 first_triangles=first_triangles,
                 distributions=uploaded.distributions,
                 bounds=(*lower, *upper),
+                emitter_power=power,
+                emitter_source=source,
             )
         )
     return done

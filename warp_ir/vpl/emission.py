@@ -64,6 +64,8 @@ class VplBuffer:
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]  # reflections before the VPL; 0 on lights
     pdf_area: wp.array[wp.float32]  # [on_lights], of the point per area of the light [1/area]; 0 where it has no area
+    lifted: int  # 1: in an uneven scene, where `lift` is defined
+    lift: wp.array[wp.float32]  # factor of the weight with which a VPL is drawn
     modifiers: wp.array[wp.int32]  # [on_lights], row of the light's `LightModifiers`, or -1; one row if none has any
 
 
@@ -198,6 +200,8 @@ def _trace_light_path(
         u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = square_to_cosine_hemisphere(u, hit.normal)
         dimension += 3
+                    if scene.uneven == 1:
+                        vpls.lift[row] = scene.emitter_lift[light.emitter]
         bounce += 1
     return vpl_count
 
@@ -224,6 +228,8 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _store_paths(
+    if source.lifted == 1:
+        target.lift[to] = source.lift[row]
     first: int,
     scene: SceneData,
     settings: LightPathSettings,
@@ -340,3 +346,5 @@ def _buffer(scene: DeviceScene, scratch: Scratch, name: str, on_lights: int, on_
     modifiers = max(on_lights, 1) if scene.data.modifier_count > 0 else 1
     vpls.modifiers = scratch.array(name + ".modifiers", modifiers, wp.int32)
     return vpls
+    vpls.lifted = scene.data.uneven
+    vpls.lift = scratch.array(name + ".lift", rows if scene.data.uneven else 1, wp.float32)
