@@ -206,7 +206,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
         say(f"{checkpoint.path}: --resume continues from this checkpoint")
-    blank = _blank_picture(scene, film)
+    blank = [*_blank_picture(scene, film), *renderer.warnings]
     if blank and not args.quiet:
         say_warnings(blank)
     _summarize(job, path, film, bool(written))

@@ -75,6 +75,8 @@ class SceneData:
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
     centre: wp.vec3  # of the bounding sphere of all surfaces, near the origin
     radius: float
+    focus: wp.vec3  # centre of the ball in which the picture's details are: of the bounding sphere, unless that is
+    focus_radius: float  # too large for float32 to resolve what the camera sees (`frame.py`)
 
     emitter_count: int
     # [emitters + 1], from 0 to 1, of the selection probabilities: by power, above a floor
@@ -82,10 +84,10 @@ class SceneData:
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
     emitter_pdf_area: wp.array[wp.float32]  # [emitters], selection probability / area; 0 for emitters without area
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or of the triangle tables
-    triangle_emitter: wp.array[wp.int32]  # [m], row of the emitter tables or -1; one row if no material emits
-
     uneven: int  # 1: the powers of some sources differ by so much that `emitter_lift` is needed
     emitter_lift: wp.array[wp.float32]  # [emitters], factor of the weights with which their VPLs are drawn; one row
+    triangle_emitter: wp.array[wp.int32]  # [m], row of the emitter tables or -1; one row if no material emits
+
     light_count: int  # analytic lights
     light_kind: wp.array[wp.int32]
     light_origin: wp.array[wp.vec3]

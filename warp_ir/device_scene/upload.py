@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene.emitter_table import upload_emitters
-from warp_ir.device_scene.frame import DeviceFrame, snapped_frame_of_box
+from warp_ir.device_scene.frame import FOCUS_RADIUS, DeviceFrame, coarse_meshes, frame_of_view, snapped_frame_of_box
 from warp_ir.device_scene.geometry_storage import storage_order
 from warp_ir.device_scene.geometry_update import DeviceGeometry, same_objects
 from warp_ir.device_scene.light_tables import UploadedLights, upload_lights
@@ -32,6 +32,10 @@ class DeviceScene:
     frame: DeviceFrame
     extent: float
     """Diagonal of the bounding box in the device's frame."""
+    detail_extent: float
+    """Edge length of the cube around the device's origin in which positions are told apart by cells."""
+    coarse: tuple[str, ...]
+    """Names of meshes in view for which float32 is too coarse, although the frame is that of the view."""
     area: float
     """Area of all surfaces in the device's frame."""
     mean_albedo: float
@@ -40,14 +44,14 @@ class DeviceScene:
     """Largest albedo of any surface and channel."""
     emits: bool
     """Whether anything in the scene emits."""
-    owners: tuple[object, ...]
-    """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
-    source: Scene
-    """The scene that was uploaded."""
     emitter_power: Floats
     """Estimated power of each emitter [emitters]."""
     emitter_source: Ints
     """The light, or part of a mesh, that each emitter belongs to [emitters]."""
+    owners: tuple[object, ...]
+    """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
+    source: Scene
+    """The scene that was uploaded."""
     geometry: DeviceGeometry
     """Shared by all shutter samples, and passed on to the next upload."""
     geometry_version: int
@@ -101,7 +105,8 @@ def upload_scenes(
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
         if not np.isfinite(np.linalg.norm(upper - lower)):
             raise InputError("scene: its extent is too large for a float")
-        frame = snapped_frame_of_box(lower, upper)
+        extent = float(np.linalg.norm(upper - lower))
+        frame = frame_of_view(scenes[0], extent) or snapped_frame_of_box(lower, upper)
         valid = [o for o in previous if o.is_valid and o.frame.equals(frame) and o.bounds == (*lower, *upper)]
         matches = [_find_same(scene, valid) for scene in scenes]
         reused = [replace(same, source=scene) for same, scene in zip(matches, scenes, strict=True) if same is not None]
@@ -124,6 +129,7 @@ def _upload(
     lights = _upload_lights(scenes, bounds, frame, launcher, [other.distributions for other in previous])
     geometry = previous[0].geometry if previous else DeviceGeometry(launcher)
     geometry.update(stored, frame)
+    device_extent = extent * frame.scale if extent > 0.0 else 1.0
     done: list[DeviceScene] = []
     for k, (scene, (data, uploaded)) in enumerate(zip(scenes, lights, strict=True)):
         same = _find_same(scene, done)
@@ -143,7 +149,9 @@ def _upload(
             DeviceScene(
                 data=data,
                 frame=frame,
-                extent=extent * frame.scale if extent > 0.0 else 1.0,
+                extent=device_extent,
+                detail_extent=2.0 * data.focus_radius if data.focus_radius < data.radius else device_extent,
+                coarse=coarse_meshes(scene, frame) if data.focus_radius < data.radius else (),
                 area=area,
                 mean_albedo=scene.mean_albedo(),
                 max_albedo=_max_albedo(scene),
@@ -182,6 +190,9 @@ def _upload_lights(
         data = SceneData()
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
+        data.focus, data.focus_radius = data.centre, data.radius
+        if not frame.equals(snapped_frame_of_box(lower, upper)):
+            data.focus, data.focus_radius = wp.vec3(0.0), FOCUS_RADIUS
         # Links name meshes by their index in the user's scene, not in storage order.
         lights = upload_lights(scene, frame, data, launcher, former)
         out.append((data, lights))

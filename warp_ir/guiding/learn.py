@@ -57,10 +57,8 @@ def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
         if len(emissive):
             points = mesh.points[emissive.reshape(-1)]
             positions += [points.min(axis=0), points.max(axis=0)]
-    lower, upper = np.reshape(scene.bounds, (2, 3))
-    return len(positions) > 1 and bool(
-        np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * np.linalg.norm(upper - lower)
-    )
+    extent = scene.detail_extent / scene.frame.scale
+    return len(positions) > 1 and bool(np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * extent)
 
 
 def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: ResolvedSettings) -> Guide:

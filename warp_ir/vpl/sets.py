@@ -251,7 +251,7 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
         group.intensity_bounce = scratch.array(f"gather.{name}.colors", max(LANES * most, 1), wp.vec4)
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
         group.shaping = scratch.array(f"gather.{name}.shapes", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
-    inputs = [lights, surfaces, scene.extent, guide.density, scene.area, keys, vpl_sets]
+    inputs = [lights, surfaces, scene.detail_extent, guide.density, scene.area, keys, vpl_sets]
     launcher.launch(_divide_into_sets, max(vpls.capacity, 1), inputs)  # also without VPLs: counts must become 0
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
     launcher.launch(_pack, sum(blocks), [vpl_sets])
