@@ -118,6 +118,7 @@ class Renderer:
             has_emission=self._layout.emission,
         )
         film.settings = self.settings
+        film.emits = any(state.scene.emits for state in self._shutter)
         if self._resolved.filter:
             self._gbuffer.tiles = film.tiles
             film.reconstruction = Reconstruction(
@@ -126,7 +127,6 @@ class Renderer:
         return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
-        film.emits = any(state.scene.emits for state in self._shutter)
         """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
         self._gbuffer.tiles = film.tiles
         number = stratum(iteration, len(self._shutter).bit_length() - 1)

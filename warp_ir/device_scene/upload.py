@@ -156,6 +156,8 @@ def _upload(
                 mean_albedo=scene.mean_albedo(),
                 max_albedo=_max_albedo(scene),
                 emits=data.emitter_count > 0,
+                emitter_power=power,
+                emitter_source=source,
                 owners=(geometry_owners, uploaded.owners, on_device),
                 source=scene,
                 geometry=geometry,
@@ -164,8 +166,6 @@ def _upload(
                 first_triangles=first_triangles,
                 distributions=uploaded.distributions,
                 bounds=(*lower, *upper),
-                emitter_power=power,
-                emitter_source=source,
             )
         )
     return done

@@ -143,6 +143,10 @@ def _trace_light_path(
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
         vpls.bounce[i] = 0
         vpls.pdf_area[i] = scene.emitter_pdf_area[light.emitter]
+        if light.large_pdf > 0.0:
+            vpls.pdf_area[i] = light.large_pdf
+        if scene.uneven == 1:
+            vpls.lift[i] = scene.emitter_lift[light.emitter]
         if scene.modifier_count > 0:
             vpls.modifiers[i] = light.modifier_row
 
@@ -196,12 +200,12 @@ def _trace_light_path(
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
                     vpls.intensity[row] = intensity * _thinning_weight(settings, total)
                     vpls.bounce[row] = bounce
+                    if scene.uneven == 1:
+                        vpls.lift[row] = scene.emitter_lift[light.emitter]
         origin = hit.position
         u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = square_to_cosine_hemisphere(u, hit.normal)
         dimension += 3
-                    if scene.uneven == 1:
-                        vpls.lift[row] = scene.emitter_lift[light.emitter]
         bounce += 1
     return vpl_count
 
@@ -224,12 +228,12 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
     target.normal[to] = source.normal[row]
     target.intensity[to] = source.intensity[row] * thinning_weight
     target.bounce[to] = source.bounce[row]
+    if source.lifted == 1:
+        target.lift[to] = source.lift[row]
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _store_paths(
-    if source.lifted == 1:
-        target.lift[to] = source.lift[row]
     first: int,
     scene: SceneData,
     settings: LightPathSettings,
@@ -343,8 +347,8 @@ def _buffer(scene: DeviceScene, scratch: Scratch, name: str, on_lights: int, on_
     vpls.intensity = scratch.array(name + ".intensity", rows, wp.vec3)
     vpls.bounce = scratch.array(name + ".bounce", rows, wp.int32)
     vpls.pdf_area = scratch.array(name + ".pdf_area", max(on_lights, 1), wp.float32)
+    vpls.lifted = scene.data.uneven
+    vpls.lift = scratch.array(name + ".lift", rows if scene.data.uneven else 1, wp.float32)
     modifiers = max(on_lights, 1) if scene.data.modifier_count > 0 else 1
     vpls.modifiers = scratch.array(name + ".modifiers", modifiers, wp.int32)
     return vpls
-    vpls.lifted = scene.data.uneven
-    vpls.lift = scratch.array(name + ".lift", rows if scene.data.uneven else 1, wp.float32)
