@@ -222,6 +222,18 @@ def test_lights_of_any_size(name):
 
 
 @pytest.mark.extended
+@pytest.mark.parametrize("estimator", ["vpl", "path"])
+def test_large_lights_with_textures(estimator):
+    """A square of 10⁶, one half of which is black: half of the light of the whole."""
+    half = np.repeat(np.array([0.0, 1.0], np.float32), 64)[None, :, None] * np.ones((64, 1, 3), np.float32)
+    light = replace(overhead(LightKind.RECT, 1.0e3, width=1.0e6, height=1.0e6), texture=half)
+    film = render(floor(light, size=1.0), estimator, visible_lights=False)
+    # Interpolation spreads the edge over a texel of 1/128 of the width; it is odd about the middle.
+    assert_mean(film, 0.5 * rect_form_factor(1.0e6, 1.0e3), bias=1.0e-3)
+    assert film.error() < 0.2
+
+
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "light",
     [

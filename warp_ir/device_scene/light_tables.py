@@ -151,11 +151,8 @@ def _light_axes(light: Light) -> Floats:
 
 
 def _is_large(light: Light, axes: Floats, radius: float) -> bool:
-    """Whether a light's area is so much larger than the disk of a radius that few samples by area light it.
-
-    Textured lights are sampled by radiance instead.
-    """
-    if light.kind > LightKind.CYLINDER or light.texture is not None or np.linalg.det(axes) == 0.0:
+    """Whether a light's area is so much larger than the disk of a radius that few samples by area light it."""
+    if light.kind > LightKind.CYLINDER or np.linalg.det(axes) == 0.0:
         return False
     return _power_per_radiance(light, axes, radius) / math.pi > _LARGE_AREA * math.pi * radius**2
 

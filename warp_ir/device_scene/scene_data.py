@@ -96,7 +96,7 @@ class SceneData:
     light_radiance: wp.array[wp.vec3]
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
     light_emitter: wp.array[wp.int32]  # [lights], row of the emitter tables or -1
-    large_light_count: int  # untextured lights with an area that is much larger than the scene
+    large_light_count: int  # lights with an area that is much larger than the scene
     light_large: wp.array[wp.int32]  # [lights], 1: half of its samples are by solid angle, from the focus
     textured_light_count: int  # lights with a texture
     modifier_count: int  # lights and emissive surfaces with modifiers

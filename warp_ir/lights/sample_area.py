@@ -18,6 +18,7 @@ from warp_ir.lights.shape import (
     modifier_row_of_surface,
     offset_from_light,
     outward_normal,
+    point_radiance,
     unit_area,
     world_from_dome,
 )
@@ -202,7 +203,7 @@ def _sample_large(address: wp.uint64, light: int, probability: float, u_techniqu
         out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
     p = wp.vec3(out.position[0], out.position[1], out.position[2])
     out.pdf = probability * large_light_pdf(scene, light, p)
-    out.intensity = scene.light_radiance[light] / out.pdf
+    out.intensity = point_radiance(scene, light, p) / out.pdf
     out.large_pdf = out.pdf
     return out
 

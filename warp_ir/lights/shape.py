@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.sampling.distribution2d import value_at_uv
+from warp_ir.sampling.distribution2d import uv_pdf, value_at_uv
 from warp_ir.sampling.solid_angle import solid_angle_pdf
 from warp_ir.scene import LightKind
 
@@ -85,6 +85,9 @@ def large_light_pdf(scene: SceneData, light: int, p: wp.vec3) -> float:
     kind = scene.light_kind[light]
     unit_n = wp.normalize(wp.transpose(scene.light_axes[light]) * n)
     pdf = 0.5 / (unit_area(kind) * area_scale(scene, light, unit_n))
+    texture = light_texture(scene, light)
+    if texture >= 0:
+        pdf *= uv_pdf(scene.light_tables[0].distributions, texture, uv_of_point(scene, light, p))
     to_light = p - scene.focus
     squared = wp.dot(to_light, to_light) + 1.0e-30
     direction = to_light / wp.sqrt(squared)
@@ -176,8 +179,24 @@ def shape_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.
 @wp.func
 def texture_uv(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
     """Texture coordinates in [0, 1]² where a ray meets a rectangle at t: u from +X to -X, v from +Y to -Y."""
-    q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
+    return uv_of_point(scene, light, origin + t * direction)
+
+
+@wp.func
+def uv_of_point(scene: SceneData, light: int, p: wp.vec3) -> wp.vec2:
+    """Texture coordinates of a point of a rectangle."""
+    q = scene.light_inverse[light] * (p - scene.light_origin[light])
     return wp.vec2(0.5 - q[0], 0.5 - q[1])
+
+
+@wp.func
+def point_radiance(scene: SceneData, light: int, p: wp.vec3) -> wp.vec3:
+    """Radiance of a light with an area at a point of it, before shaping."""
+    texture = light_texture(scene, light)
+    if texture < 0:
+        return scene.light_radiance[light]
+    uv = uv_of_point(scene, light, p)
+    return wp.cw_mul(scene.light_radiance[light], value_at_uv(scene.light_tables[0].distributions, texture, uv))
 
 
 @wp.func
