@@ -94,6 +94,14 @@ class Renderer:
             self._upload(scene)
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the picture cannot show precisely: one line each, beginning with the prim's path."""
+        return tuple(
+            f"{name}: its triangles reach so far that float32 is coarse where the camera sees them; divide them"
+            for name in dict.fromkeys(name for state in self._shutter for name in state.scene.coarse)
+        )
+
+    @property
     def scene(self) -> DeviceScene:
         """The scene on the device; with motion blur, its first shutter sample."""
         return self._shutter[0].scene
@@ -113,6 +121,7 @@ class Renderer:
             and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
         )
         film.settings = self.settings
+        film.emits = any(state.scene.emits for state in self._shutter)
         if self._resolved.filter:
             self._gbuffer.tiles = film.tiles
             film.reconstruction = Reconstruction(

@@ -24,6 +24,8 @@ _MIN_TILE_SHARE = 1 / 8
 """Least fraction of the tiles in an iteration: fewer do not occupy many cores."""
 _TIME_MARGIN = 0.8
 """Fraction of the time left that the last iteration is planned to take: the worst tiles take longer than the mean."""
+_UNLIT_ITERATIONS = 64
+"""Iterations of a picture without light, after which a target error gives up: no error of it is known."""
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -74,7 +76,7 @@ class AdaptiveScheduler:
             if measure_error and math.sqrt(squares.sum()) <= (self._settings.target_error or 0.0):
                 squares = film.squared_errors(filtered=True)  # expensive: it makes the picture
             if measure_error:
-                self._error = math.sqrt(squares.sum())
+                self._error = 1.0 if film.is_unlit() else math.sqrt(squares.sum())
             if self._adaptive:
                 film.choose(select_tiles(squares, film.tile_iterations, max_tiles))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())
@@ -86,7 +88,9 @@ class AdaptiveScheduler:
         if settings.time_limit is not None:
             # An iteration that would exceed the limit is not started.
             shares.append((film.seconds + needed) / settings.time_limit)
-        if settings.target_error is not None and error > 0.0:
+        if settings.target_error is not None and error == 1.0 and film.is_unlit():
+            shares.append(film.iterations / _UNLIT_ITERATIONS)
+        elif settings.target_error is not None and error > 0.0:
             shares.append((settings.target_error / error) ** 2)
         elif settings.target_error is not None and error == 0.0:
             shares.append(1.0)

@@ -218,6 +218,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
     blank = _blank_picture(scene, film)
     explained = any(words in line for line in scene.warnings for words in _EXPLANATIONS)
     picture_warnings = [*([f"{scene.camera.name}: {blank}"] if blank and not explained else []), *write_warnings]
+    picture_warnings += renderer.warnings
     if not args.quiet:
         say_warnings(picture_warnings)
     _summarize(job, path, film, written=bool(written), blank=bool(blank))

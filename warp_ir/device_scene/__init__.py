@@ -4,6 +4,7 @@
 """
 
 from warp_ir.device_scene.camera_data import CameraData, camera_data
+from warp_ir.device_scene.emitter_table import emitter_lifts, floored_probabilities, selection_cdf
 from warp_ir.device_scene.frame import DeviceFrame
 from warp_ir.device_scene.scene_data import INSTANCE_COLOR, TRIANGLE_EMITTER, SceneData, SurfaceTextures
 from warp_ir.device_scene.upload import DeviceScene, upload_scene, upload_scenes
@@ -17,6 +18,9 @@ __all__ = [
     "SceneData",
     "SurfaceTextures",
     "camera_data",
+    "emitter_lifts",
+    "floored_probabilities",
+    "selection_cdf",
     "upload_scene",
     "upload_scenes",
 ]

@@ -1,4 +1,8 @@
-"""The emitter tables: all lights and emissive triangles, with the probability of selecting each."""
+"""The emitter tables: all lights and emissive triangles, with the probability of selecting each.
+
+Power says little about what lights the picture: a lamp in the room that the camera sees may have 10⁻¹² of the power of
+one in a sealed room. So every source, a light or the part of a mesh that one material covers, keeps a floor.
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,6 +20,57 @@ from warp_ir.light_modifiers import shaped_power
 from warp_ir.scene import Floats, Ints, Mesh, Scene
 from warp_ir.texture import mean_on_triangles
 
+FLOOR_SHARE = 1.0 / 8.0
+"""Largest share of the samples that sources of little power get; each source gets as much of it as any other."""
+_STEPS = 2**24
+"""Number of sample numbers in [0, 1), `sampling.sobol.to_unit`: probabilities are multiples of its inverse."""
+
+
+def floored_probabilities(power: Floats, source: Ints, floor_share: float) -> npt.NDArray[np.float64]:
+    """Selection probabilities of emitters in proportion to power, but for each source at least a floor.
+
+    Args:
+        power: Power of each emitter, or any multiple of it, positive.
+        source: The source, from 0, that each emitter is a part of.
+        floor_share: Share of all samples that the floors of all sources have together.
+    """
+    of_source = np.bincount(source, power)
+    share = of_source / of_source.sum()
+    floor = floor_share / len(share)
+    if share.min() >= floor:
+        return np.asarray(power / power.sum(), np.float64)
+    lifted = np.maximum(share, floor)
+    return np.asarray(power / of_source[source] * (lifted / lifted.sum())[source], np.float64)
+
+
+def is_uneven(power: Floats, source: Ints) -> bool:
+    """Whether a source has so little power that it needs its floor."""
+    of_source = np.bincount(source, power)
+    return bool(of_source.min() * len(of_source) < FLOOR_SHARE * of_source.sum())
+
+
+def emitter_lifts(cdf: Floats, power: Floats) -> npt.NDArray[np.float64]:
+    """Factors of the weights with which VPLs are drawn for shadow rays, float64 [emitters].
+
+    VPLs of an emitter of power Φ and selection probability p have an intensity in proportion to Φ/p; their weights
+    follow Φ/p plus a share of the mean over all emitters. So an emitter that light paths start from gets shadow rays
+    as well, whatever the power of one that no surface in view receives light from.
+    """
+    return np.asarray(np.minimum(1.0 + FLOOR_SHARE * np.diff(cdf) * (power.sum() / power), 1.0e30), np.float64)
+
+
+def selection_cdf(probability: Floats) -> npt.NDArray[np.float64]:
+    """The CDF [n + 1] of probabilities [n], in multiples of 2⁻²⁴, which float32 and the samples represent exactly.
+
+    Every probability is at least 2⁻²⁴, unless there are more than 2²³ emitters.
+    """
+    n = len(probability)
+    least = np.arange(n + 1) if 2 * n <= _STEPS else np.zeros(n + 1)
+    cumulative = np.concatenate([[0.0], np.cumsum(probability)])
+    cdf = least + np.floor(cumulative / cumulative[-1] * (_STEPS - least[-1]))
+    cdf[-1] = _STEPS
+    return np.asarray(cdf / _STEPS, np.float64)
+
 
 def upload_emitters(
     scene: Scene,
@@ -24,8 +79,8 @@ def upload_emitters(
     frame: DeviceFrame,
     data: SceneData,
     launcher: Launcher,
-) -> None:
-    """Fills the emitter tables of a `SceneData`; an emitter's selection probability is proportional to its power.
+) -> tuple[Floats, Ints]:
+    """Fills the emitter tables of a `SceneData`; selection probabilities are proportional to power, above a floor.
 
     Any positive probabilities are unbiased, so power is only estimated, from mean radiance times area. Emitters of
     power 0 are left out.
@@ -37,22 +92,27 @@ def upload_emitters(
         frame: The device's frame.
         data: The `SceneData`; its geometry tables must have been filled.
         launcher: Launcher of the device.
+
+    Returns:
+        Power and source of each emitter (`floored_probabilities`).
     """
     kinds: list[npt.NDArray[np.int32]] = []
     items: list[npt.NDArray[np.int32]] = []
     powers: list[npt.NDArray[np.float64]] = []
     areas: list[npt.NDArray[np.float64]] = []
+    sources: list[npt.NDArray[np.int64]] = []
     if scene.lights:
         kinds.append(np.array([light.kind for light in scene.lights], np.int32))
         items.append(np.arange(len(scene.lights), dtype=np.int32))
         powers.append(lights.power)
         areas.append(lights.area)
+        sources.append(np.arange(len(scene.lights)))
 
     emission = np.array([m.emission for m in scene.materials], np.float64).reshape(-1, 3).mean(axis=1)
-    for mesh, first in zip(scene.meshes, first_triangles, strict=True):
+    for k, (mesh, first) in enumerate(zip(scene.meshes, first_triangles, strict=True)):
         emissive = np.nonzero(emission[mesh.material] > 0.0)[0] if emission.any() else np.zeros(0, np.int64)
         if len(emissive):
-            a, b, c = (mesh.points[mesh.triangles[emissive, k]] * frame.scale for k in range(3))
+            a, b, c = (mesh.points[mesh.triangles[emissive, j]] * frame.scale for j in range(3))
             cross = np.cross(b - a, c - a)
             length = np.linalg.norm(cross, axis=1)
             area = 0.5 * length
@@ -65,15 +125,20 @@ def upload_emitters(
             items.append((first + emissive).astype(np.int32))
             areas.append(sides * area)
             powers.append(power)
+            sources.append(len(scene.lights) + k * len(scene.materials) + mesh.material[emissive].astype(np.int64))
 
-    kind, item = (np.concatenate(x) if x else np.zeros(0, np.int32) for x in (kinds, items))
+    kind, item, source = (np.concatenate(x) if x else np.zeros(0, np.int32) for x in (kinds, items, sources))
     power, area = (np.concatenate(x) if x else np.zeros(0) for x in (powers, areas))
     emits = power > 0.0
     kind, item, power, area = kind[emits], item[emits], power[emits], area[emits]
+    source = np.unique(source[emits], return_inverse=True)[1]
     data.emitter_count = len(power)
-    cdf = np.concatenate([[0.0], np.cumsum(power / power.sum())]) if len(power) else np.array([0.0, 1.0])
-    cdf[-1] = 1.0
+    cdf = np.array([0.0, 1.0])
+    if len(power):
+        cdf = selection_cdf(floored_probabilities(power, source, FLOOR_SHARE))
     data.emitter_cdf = launcher.array(cdf, wp.float32)
+    data.uneven = int(len(power) > 0 and is_uneven(power, source))
+    data.emitter_lift = launcher.array(emitter_lifts(cdf, power) if data.uneven else [1.0], wp.float32)
     data.emitter_pdf_area = launcher.array(np.diff(cdf) / area if len(power) else [0.0], wp.float32)
     data.emitter_kind = launcher.array(kind if len(kind) else [0], wp.int32)
     data.emitter_item = launcher.array(item if len(item) else [0], wp.int32)
@@ -87,6 +152,7 @@ def upload_emitters(
     triangle_emitter = np.full(data.triangle_count if emission.any() else 1, -1, np.int32)
     triangle_emitter[item[~analytic]] = emitter[~analytic]
     data.triangle_emitter = launcher.array(triangle_emitter, wp.int32)
+    return power, source
 
 
 def _mean_emission(scene: Scene, mesh: Mesh, triangles: Ints, areas: Floats, footprint: float) -> Floats:

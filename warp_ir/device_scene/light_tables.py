@@ -15,6 +15,9 @@ from warp_ir.light_modifiers import upload_light_modifiers
 from warp_ir.sampling.distribution2d import Distribution2DList, row_areas
 from warp_ir.scene import Floats, InputError, Light, LightKind, Scene
 
+_LARGE_AREA = 4.0
+"""Area of a light above which it `_is_large`, relative to the disk of the ball of details."""
+
 
 class UploadedLights(NamedTuple):
     """What else is known of lights whose tables are on the device."""
@@ -63,6 +66,9 @@ def upload_lights(
     data.light_axes = launcher.array(axis_rows, wp.mat33)
     data.light_inverse = launcher.array(_rows(np.array([_inverse(a) for a in axes]), (3, 3)), wp.mat33)
     data.light_radiance = launcher.array(radiance_rows, wp.vec3)
+    large = [_is_large(light, axes[k], data.focus_radius) for k, light in enumerate(lights)]
+    data.large_light_count = sum(large)
+    data.light_large = launcher.array([int(x) for x in large] or [0], wp.int32)
     data.light_angle = launcher.array(angle or [0.0], wp.float32)
     tables.texture = launcher.array(texture or [-1], wp.int32)
     tables.distributions = distributions.upload(launcher)
@@ -79,9 +85,11 @@ def upload_lights(
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
     data.shape_bvh = bvh.id
     flux = np.array([_power_per_radiance(light, axis_rows[k], data.radius) for k, light in enumerate(lights)])
+    # However large a light, what reaches the ball of details is no more than that of a dome.
+    reaching = np.where(large, np.minimum(flux, 4.0 * math.pi**2 * data.focus_radius**2), flux)
     mean_radiance = radiance_rows[: len(lights)].mean(axis=1, dtype=np.float64)
     has_area = np.array([light.kind <= LightKind.CYLINDER for light in lights], bool)
-    power = mean_radiance * flux * (texture_factor * shaping_factor)
+    power = mean_radiance * reaching * (texture_factor * shaping_factor)
     return UploadedLights((bvh, tables), distributions, power, np.where(has_area, flux / math.pi, np.inf))
 
 
@@ -140,6 +148,13 @@ def _light_axes(light: Light) -> Floats:
     rotation = np.empty((3, 3))
     rotation[:, order] = np.linalg.qr(linear[:, order])[0]
     return np.asarray(rotation * np.where(np.sum(rotation * linear, axis=0) < 0.0, -1.0, 1.0))
+
+
+def _is_large(light: Light, axes: Floats, radius: float) -> bool:
+    """Whether a light's area is so much larger than the disk of a radius that few samples by area light it."""
+    if light.kind > LightKind.CYLINDER or np.linalg.det(axes) == 0.0:
+        return False
+    return _power_per_radiance(light, axes, radius) / math.pi > _LARGE_AREA * math.pi * radius**2
 
 
 def _inverse(axes: Floats) -> Floats:

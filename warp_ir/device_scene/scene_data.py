@@ -75,12 +75,17 @@ class SceneData:
     emits_back: wp.array[wp.int32]  # [m], 1 if an emissive material emits from the back too
     centre: wp.vec3  # of the bounding sphere of all surfaces, near the origin
     radius: float
+    focus: wp.vec3  # centre of the ball in which the picture's details are: of the bounding sphere, unless that is
+    focus_radius: float  # too large for float32 to resolve what the camera sees (`frame.py`)
 
     emitter_count: int
-    emitter_cdf: wp.array[wp.float32]  # [emitters + 1], from 0 to 1; selection probabilities are proportional to power
+    # [emitters + 1], from 0 to 1, of the selection probabilities: by power, above a floor
+    emitter_cdf: wp.array[wp.float32]
     emitter_kind: wp.array[wp.int32]  # [emitters], LightKind, or TRIANGLE_EMITTER
     emitter_pdf_area: wp.array[wp.float32]  # [emitters], selection probability / area; 0 for emitters without area
     emitter_item: wp.array[wp.int32]  # [emitters], row of the light tables, or of the triangle tables
+    uneven: int  # 1: the powers of some sources differ by so much that `emitter_lift` is needed
+    emitter_lift: wp.array[wp.float32]  # [emitters], factor of the weights with which their VPLs are drawn; one row
     triangle_emitter: wp.array[wp.int32]  # [m], row of the emitter tables or -1; one row if no material emits
 
     light_count: int  # analytic lights
@@ -91,6 +96,8 @@ class SceneData:
     light_radiance: wp.array[wp.vec3]
     light_angle: wp.array[wp.float32]  # 1 - cosθ_max of a DISTANT light
     light_emitter: wp.array[wp.int32]  # [lights], row of the emitter tables or -1
+    large_light_count: int  # lights with an area that is much larger than the scene
+    light_large: wp.array[wp.int32]  # [lights], 1: half of its samples are by solid angle, from the focus
     textured_light_count: int  # lights with a texture
     modifier_count: int  # lights and emissive surfaces with modifiers
     shaped_count: int  # of these, those with a shaping

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device_scene.emitter_table import upload_emitters
-from warp_ir.device_scene.frame import DeviceFrame, snapped_frame_of_box
+from warp_ir.device_scene.frame import FOCUS_RADIUS, DeviceFrame, coarse_meshes, frame_of_view, snapped_frame_of_box
 from warp_ir.device_scene.geometry_storage import storage_order
 from warp_ir.device_scene.geometry_update import DeviceGeometry, same_objects
 from warp_ir.device_scene.light_tables import UploadedLights, upload_lights
@@ -17,7 +17,7 @@ from warp_ir.device_scene.scene_data import SceneData
 from warp_ir.device_scene.validate import check_scene
 from warp_ir.sampling import sobol
 from warp_ir.sampling.distribution2d import Distribution2DList
-from warp_ir.scene import Floats, InputError, Scene, materials_of
+from warp_ir.scene import Floats, InputError, Ints, Scene, materials_of
 
 _TEXTURE_PATCHES = 2**14
 """Indirect light averages textures over this fraction of the scene's surface area: VPLs are not denser than that."""
@@ -32,6 +32,10 @@ class DeviceScene:
     frame: DeviceFrame
     extent: float
     """Diagonal of the bounding box in the device's frame."""
+    detail_extent: float
+    """Edge length of the cube around the device's origin in which positions are told apart by cells."""
+    coarse: tuple[str, ...]
+    """Names of meshes in view for which float32 is too coarse, although the frame is that of the view."""
     area: float
     """Area of all surfaces in the device's frame."""
     mean_albedo: float
@@ -40,6 +44,10 @@ class DeviceScene:
     """Largest albedo of any surface and channel."""
     emits: bool
     """Whether anything in the scene emits."""
+    emitter_power: Floats
+    """Estimated power of each emitter [emitters]."""
+    emitter_source: Ints
+    """The light, or part of a mesh, that each emitter belongs to [emitters]."""
     owners: tuple[object, ...]
     """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
     source: Scene
@@ -97,7 +105,8 @@ def upload_scenes(
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
         if not np.isfinite(np.linalg.norm(upper - lower)):
             raise InputError("scene: its extent is too large for a float")
-        frame = snapped_frame_of_box(lower, upper)
+        extent = float(np.linalg.norm(upper - lower))
+        frame = frame_of_view(scenes[0], extent) or snapped_frame_of_box(lower, upper)
         valid = [o for o in previous if o.is_valid and o.frame.equals(frame) and o.bounds == (*lower, *upper)]
         matches = [_find_same(scene, valid) for scene in scenes]
         reused = [replace(same, source=scene) for same, scene in zip(matches, scenes, strict=True) if same is not None]
@@ -120,6 +129,7 @@ def _upload(
     lights = _upload_lights(scenes, bounds, frame, launcher, [other.distributions for other in previous])
     geometry = previous[0].geometry if previous else DeviceGeometry(launcher)
     geometry.update(stored, frame)
+    device_extent = extent * frame.scale if extent > 0.0 else 1.0
     done: list[DeviceScene] = []
     for k, (scene, (data, uploaded)) in enumerate(zip(scenes, lights, strict=True)):
         same = _find_same(scene, done)
@@ -130,7 +140,7 @@ def _upload(
         data.footprint = math.sqrt(area / _TEXTURE_PATCHES)
         geometry_owners = geometry.fill(k, data)
         first_triangles = geometry.first_triangles(k)
-        upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
+        power, source = upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
         data.sobol = launcher.array(sobol.sobol_matrices(), wp.uint32)
         on_device = launcher.empty(1, SceneData)
         data.address = wp.uint64(on_device.ptr)  # set in the copy as well: functions that read it pass it on
@@ -139,11 +149,15 @@ def _upload(
             DeviceScene(
                 data=data,
                 frame=frame,
-                extent=extent * frame.scale if extent > 0.0 else 1.0,
+                extent=device_extent,
+                detail_extent=2.0 * data.focus_radius if data.focus_radius < data.radius else device_extent,
+                coarse=coarse_meshes(scene, frame) if data.focus_radius < data.radius else (),
                 area=area,
                 mean_albedo=scene.mean_albedo(),
                 max_albedo=_max_albedo(scene),
                 emits=data.emitter_count > 0,
+                emitter_power=power,
+                emitter_source=source,
                 owners=(geometry_owners, uploaded.owners, on_device),
                 source=scene,
                 geometry=geometry,
@@ -176,6 +190,9 @@ def _upload_lights(
         data = SceneData()
         data.centre = wp.vec3(*frame.to_device(0.5 * (lower + upper)).tolist())
         data.radius = 0.5 * extent * frame.scale * 1.0001 if extent > 0.0 else 1.0
+        data.focus, data.focus_radius = data.centre, data.radius
+        if not frame.equals(snapped_frame_of_box(lower, upper)):
+            data.focus, data.focus_radius = wp.vec3(0.0), FOCUS_RADIUS
         # Links name meshes by their index in the user's scene, not in storage order.
         lights = upload_lights(scene, frame, data, launcher, former)
         out.append((data, lights))

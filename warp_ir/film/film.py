@@ -94,6 +94,8 @@ class Film:
         """Numbers of rays, VPLs and others over all iterations."""
         self.reconstruction: PictureFilter | None = None
         """The filter of the picture; None: the picture is the unfiltered mean."""
+        self.emits = False
+        """Whether anything in the scene emits: then no surface need be black."""
         self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them
         self._denoised: tuple[int, Image] | None = None
         self._frame = frame or DeviceFrame(np.zeros(3), 1.0)
@@ -234,11 +236,20 @@ class Film:
         it, unless it has been made. Where L is uncertain, the denominator moves towards the smaller median of its
         neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
 
-        NaN with fewer than two iterations.
+        1 if the scene emits and none of that light has reached a surface in view: what the samples have missed is
+        unknown. NaN with fewer than two iterations.
         """
         if self.iterations < 2:
             return math.nan
+        if self.is_unlit():
+            return 1.0
         return math.sqrt(self.squared_errors(filtered=True).sum())
+
+    def is_unlit(self) -> bool:
+        """Whether the camera sees surfaces that reflect, and no iteration has found any light on them."""
+        if not self.emits or not (self._data.albedo.numpy() > 0.0).any():
+            return False
+        return not (self._data.direct.numpy().any() or self._data.indirect.numpy().any())
 
     def squared_errors(self, *, filtered: bool = False) -> npt.NDArray[np.float64]:
         """Contribution of every tile of 8 x 8 pixels to the square of `error`, [tiles], row by row.

@@ -7,30 +7,49 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher, copy_record
-from warp_ir.device_scene import DeviceScene, SceneData
+from warp_ir.device_scene import DeviceScene, SceneData, emitter_lifts, floored_probabilities, selection_cdf
 from warp_ir.guiding.probes import CameraProbes
 
 Floats = npt.NDArray[np.float64]
 
 POWER_FRACTION = 0.25
 """Share of the light paths that start in proportion to power: no weight grows by more than a factor of four."""
+PROBE_FLOOR_SHARE = 0.5
+"""Share of the probes' samples that sources of little power have together."""
 PRIOR = 4.0
 """Number of samples that the prior, selection by power, counts for beside the probes."""
 MIN_GAIN = 1.15
 """Least ratio of the variance without guiding to that with it, below which nothing is changed."""
 
 
-def learn_emitter_probabilities(scene: DeviceScene, probes: CameraProbes, launcher: Launcher) -> DeviceScene | None:
-    """The scene with learned selection probabilities of its emitters; None if the gain is below `MIN_GAIN`."""
+def probe_scene(scene: DeviceScene, launcher: Launcher) -> DeviceScene:
+    """The scene with the selection probabilities of probe paths: half of them for all sources alike, at least."""
+    if scene.data.emitter_count < 2:
+        return scene
+    wanted = floored_probabilities(scene.emitter_power, scene.emitter_source, PROBE_FLOOR_SHARE)
+    return _with_probabilities(scene, wanted, launcher)
+
+
+def learn_emitter_probabilities(
+    scene: DeviceScene, probed: DeviceScene, probes: CameraProbes, launcher: Launcher
+) -> DeviceScene | None:
+    """The scene with learned selection probabilities of its emitters; None if the gain is below `MIN_GAIN`.
+
+    Args:
+        scene: The scene.
+        probed: The scene with the probabilities by which the probe paths selected emitters (`probe_scene`).
+        probes: What they measured.
+        launcher: Launcher of the device.
+    """
     if scene.data.emitter_count < 2:
         return None
-    power = np.diff(scene.data.emitter_cdf.numpy().astype(np.float64))
-    power = np.maximum(power, np.finfo(np.float32).tiny)  # a probability too small for float32
+    power, sampled = (np.diff(s.data.emitter_cdf.numpy().astype(np.float64)) for s in (scene, probed))
     learned = probabilities(power, probes.emitter[probes.training], probes.score[probes.training])
     emitter, squares = probes.emitter[~probes.training], probes.score[~probes.training] ** 2
-    if squares.sum() <= MIN_GAIN * (squares * (power / learned)[emitter]).sum():
+    before, after = ((squares * (sampled / p)[emitter]).sum() for p in (power, learned))
+    if before <= MIN_GAIN * after:
         return None
-    return _with_probabilities(scene, power, probabilities(power, probes.emitter, probes.score), launcher)
+    return _with_probabilities(scene, probabilities(power, probes.emitter, probes.score), launcher)
 
 
 def probabilities(power: Floats, emitter: npt.NDArray[np.int64], score: Floats) -> Floats:
@@ -40,7 +59,7 @@ def probabilities(power: Floats, emitter: npt.NDArray[np.int64], score: Floats) 
     with many samples, the children get the shares of their samples; with few samples, the shares of their power.
 
     Args:
-        power: Selection probabilities of the samples, float64 [emitters], positive.
+        power: Selection probabilities without samples, float64 [emitters], positive.
         emitter: Emitter of each sample.
         score: Contribution of each sample over its selection probability.
     """
@@ -62,13 +81,15 @@ def _ratio(a: Floats, b: Floats) -> Floats:
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0.0)
 
 
-def _with_probabilities(scene: DeviceScene, power: Floats, probability: Floats, launcher: Launcher) -> DeviceScene:
+def _with_probabilities(scene: DeviceScene, probability: Floats, launcher: Launcher) -> DeviceScene:
     """The scene with other selection probabilities of its emitters."""
     data = copy_record(scene.data)
-    cdf = np.concatenate([[0.0], np.cumsum(probability)])
-    cdf /= cdf[-1]
+    before, cdf = scene.data.emitter_cdf.numpy().astype(np.float64), selection_cdf(probability)
     data.emitter_cdf = launcher.array(cdf, wp.float32)
-    data.emitter_pdf_area = launcher.array(scene.data.emitter_pdf_area.numpy() * (np.diff(cdf) / power), wp.float32)
+    if data.uneven:
+        data.emitter_lift = launcher.array(emitter_lifts(cdf, scene.emitter_power), wp.float32)
+    ratio = np.diff(cdf) / np.diff(before)
+    data.emitter_pdf_area = launcher.array(scene.data.emitter_pdf_area.numpy() * ratio, wp.float32)
     device_copy = launcher.empty(1, SceneData)
     data.address = wp.uint64(device_copy.ptr)
     device_copy.assign(launcher.array([data], SceneData))

@@ -20,7 +20,7 @@ import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene
-from warp_ir.guiding.emitter_selection import learn_emitter_probabilities
+from warp_ir.guiding.emitter_selection import learn_emitter_probabilities, probe_scene
 from warp_ir.guiding.importance import learn_survival
 from warp_ir.guiding.photon_target import learn_photon_target
 from warp_ir.guiding.probes import connect_vpls, trace_camera_probes
@@ -39,7 +39,7 @@ _PIXELS_PER_PATH = 2
 
 
 def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
-    """Whether there is anything to learn: lights at infinity, or emitters far apart.
+    """Whether there is anything to learn: lights at infinity, emitters far apart, or of very different power.
 
     Args:
         scene: The scene.
@@ -48,6 +48,8 @@ def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
     lights, materials = scene.stored.lights, scene.stored.materials
     if any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in lights):
         return True
+    if scene.data.uneven:
+        return True
     positions = [light.world_from_light[:3, 3] for light in lights]
     emits = np.array([max(material.emission) > 0.0 for material in materials], bool)
     for mesh in scene.stored.meshes if emits.any() else ():
@@ -55,10 +57,8 @@ def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
         if len(emissive):
             points = mesh.points[emissive.reshape(-1)]
             positions += [points.min(axis=0), points.max(axis=0)]
-    lower, upper = np.reshape(scene.bounds, (2, 3))
-    return len(positions) > 1 and bool(
-        np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * np.linalg.norm(upper - lower)
-    )
+    extent = scene.detail_extent / scene.frame.scale
+    return len(positions) > 1 and bool(np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * extent)
 
 
 def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: ResolvedSettings) -> Guide:
@@ -80,9 +80,10 @@ def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: 
     guided_scene = photon_target = survival = None
     vpls_per_path = _VPLS_PER_PATH
     if scene.emits:
-        probes = trace_camera_probes(scene, camera, launcher, paths, settings)
+        probed = probe_scene(scene, launcher)
+        probes = trace_camera_probes(probed, camera, launcher, paths, settings)
         if probes.score.any():
-            guided_scene = learn_emitter_probabilities(scene, probes, launcher)
+            guided_scene = learn_emitter_probabilities(scene, probed, probes, launcher)
             photon_target = learn_photon_target(scene, probes, launcher)
             guide = replace(guide, scene=guided_scene or scene, photon_target=photon_target or guide.photon_target)
             if max_paths > 1:

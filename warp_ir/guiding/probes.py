@@ -246,7 +246,7 @@ def connect_vpls(
     )
     on_surfaces = int(vpls.count.numpy()[0]) - vpls.on_lights
     n = min(on_surfaces, _MAX_VPLS_PER_PATH * paths)
-    extent = 2.0 * float(scene.data.radius)
+    extent = 2.0 * float(scene.data.focus_radius)
     cells, contribution = launcher.empty(max(n, 1), wp.int32), launcher.empty(max(n, 1) * _CONNECTIONS, wp.float32)
     selected = vpls.on_lights + np.arange(n) * on_surfaces // max(n, 1)
     rows = launcher.array(selected, wp.int32)

@@ -4,7 +4,14 @@ import warp as wp
 
 from warp_ir.device_scene import SceneData
 from warp_ir.lights.intersect import modified_emission
-from warp_ir.lights.shape import intersect_shape, modifier_row_of_light, modifier_row_of_surface, shape_radiance
+from warp_ir.lights.shape import (
+    intersect_shape,
+    is_large,
+    large_light_pdf,
+    modifier_row_of_light,
+    modifier_row_of_surface,
+    shape_radiance,
+)
 from warp_ir.lights.visibility import (
     CROSSINGS,
     continue_behind,
@@ -94,7 +101,7 @@ def _clamped_light_radiance(
             light = scene.shape_light[shape]
             hit = intersect_shape(scene, light, origin, direction)
             if hit[3] > 0.0 and hit[3] < t_max and may_intersect(scene, modifier_row_of_light(scene, light), mesh, 0.0):
-                fraction = _light_clamped_fraction(scene, light, hit, direction, cosine, bound)
+                fraction = _light_clamped_fraction(scene, light, hit, origin, direction, cosine, bound)
                 if fraction > 0.0:
                     radiance = shape_radiance(scene, light, origin, direction, hit[3])
                     total += (
@@ -106,7 +113,7 @@ def _clamped_light_radiance(
         light = scene.light_tables[0].modifiers.only_sampled_lights[k]
         hit = intersect_shape(scene, light, origin, direction)
         if hit[3] > 0.0 and hit[3] < max_distance:
-            fraction = _light_clamped_fraction(scene, light, hit, direction, cosine, bound)
+            fraction = _light_clamped_fraction(scene, light, hit, origin, direction, cosine, bound)
             if fraction > 0.0:
                 p = origin + direction * (hit[3] * 0.99999)
                 visibility = light_visibility(
@@ -185,9 +192,14 @@ def clamped_surface_radiance(
 
 @wp.func
 def _light_clamped_fraction(
-    scene: SceneData, light: int, hit: wp.vec4, direction: wp.vec3, cosine: float, bound: Bound
+    scene: SceneData, light: int, hit: wp.vec4, origin: wp.vec3, direction: wp.vec3, cosine: float, bound: Bound
 ) -> float:
     """`clamped_fraction` where a ray hits a light; `hit` is the result of `intersect_shape`."""
     world_n = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
     g = -wp.dot(world_n, direction) * cosine / (hit[3] * hit[3])
-    return clamped_fraction(bound_for_pdf(bound, scene.emitter_pdf_area[scene.light_emitter[light]]), g)
+    emitter = scene.light_emitter[light]
+    pdf = scene.emitter_pdf_area[emitter]
+    if is_large(scene, light):
+        probability = scene.emitter_cdf[emitter + 1] - scene.emitter_cdf[emitter]
+        pdf = probability * large_light_pdf(scene, light, origin + direction * hit[3])
+    return clamped_fraction(bound_for_pdf(bound, pdf), g)

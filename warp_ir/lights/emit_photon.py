@@ -8,9 +8,12 @@ from warp_ir.lights.sample_area import EmitterSample
 from warp_ir.lights.visibility import CROSSINGS, continue_behind
 from warp_ir.sampling.distribution2d import cell_direction, sample_cell
 from warp_ir.sampling.square_to import from_local, square_to_cone, square_to_cosine_hemisphere, square_to_disk
-from warp_ir.surface import Hit, closest, scene_at
+from warp_ir.surface import Hit, closest, scene_at, visible
 
 wp.set_module_options({"enable_backward": False})
+
+_FAR_SQUARED = wp.constant(16.0)
+"""Squared distance of points on lights whose photons are aimed, relative to the radius of the ball of details."""
 
 
 @wp.struct
@@ -51,8 +54,10 @@ def emit_photon(scene: SceneData, point: EmitterSample, photon_target: PhotonTar
             focus = photon_target.focus[scene.emitter_item[point.emitter]]
             offset = from_local(wp.vec3(target[0], target[1], 0.0), xyz)
             out.origin = wp.vec3(focus[0], focus[1], focus[2]) + offset
-            out.origin += (scene.radius - wp.dot(out.origin - scene.centre, xyz)) * xyz
+            out.origin = _start_outside(scene, out.origin, xyz)
             out.flux = point.intensity * target[2]
+    elif wp.length_sq(scene.focus - xyz) > _FAR_SQUARED * scene.focus_radius * scene.focus_radius:
+        out = _aim_at_focus(scene, point, u)
     elif point.normal[3] == 1.0:
         out.origin = xyz
         out.direction = square_to_cone(u, 2.0, wp.vec3(0.0, 0.0, 1.0))
@@ -63,6 +68,47 @@ def emit_photon(scene: SceneData, point: EmitterSample, photon_target: PhotonTar
         out.flux = point.intensity * wp.pi
     if point.modifier_row >= 0:
         out = _shape_photon(scene.address, point, u, out)
+    return out
+
+
+@wp.func
+def _start_outside(scene: SceneData, p: wp.vec3, to_light: wp.vec3) -> wp.vec3:
+    """Where a photon of an infinite light starts that passes a point: outside the scene.
+
+    If nothing is in its way it starts outside the ball of details alone, where float32 is precise.
+    """
+    if scene.focus_radius < scene.radius:
+        near = p + (scene.focus_radius - wp.dot(p - scene.focus, to_light)) * to_light
+        if visible(scene, near, wp.vec4(to_light[0], to_light[1], to_light[2], 0.0)):
+            return near
+    return p + (scene.radius - wp.dot(p - scene.centre, to_light)) * to_light
+
+
+@wp.func
+def _aim_at_focus(scene: SceneData, point: EmitterSample, u: wp.vec2) -> Photon:
+    """A photon of a distant point on an emitter, aimed at the ball of details; half of them if that is not all."""
+    out = Photon()
+    out.origin = wp.vec3(point.position[0], point.position[1], point.position[2])
+    n = wp.vec3(point.normal[0], point.normal[1], point.normal[2])
+    to_focus = scene.focus - out.origin
+    axis = wp.normalize(to_focus)
+    sine_squared = scene.focus_radius * scene.focus_radius / wp.dot(to_focus, to_focus)
+    cone = sine_squared / (1.0 + wp.sqrt(1.0 - sine_squared))  # 1 - cosθ of the ball
+    aimed = wp.where(scene.focus_radius < scene.radius, 0.5, 1.0)
+    if u[0] < aimed:
+        out.direction = square_to_cone(wp.vec2(u[0] / aimed, u[1]), cone, axis)
+    else:
+        v = wp.vec2((u[0] - aimed) / (1.0 - aimed), u[1])
+        if point.normal[3] == 1.0:
+            out.direction = square_to_cone(v, 2.0, wp.vec3(0.0, 0.0, 1.0))
+        else:
+            out.direction = square_to_cosine_hemisphere(v, n)
+    cosine = wp.max(0.0, point.normal[3] + wp.dot(n, out.direction))
+    pdf = (1.0 - aimed) * cosine / (wp.pi * (1.0 + 3.0 * point.normal[3]))
+    difference = out.direction - axis
+    if u[0] < aimed or 0.5 * wp.length_sq(difference) < cone:
+        pdf += aimed / (2.0 * wp.pi * cone)
+    out.flux = point.intensity * (cosine / pdf)
     return out
 
 

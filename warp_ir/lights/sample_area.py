@@ -10,16 +10,21 @@ import warp as wp
 from warp_ir.device_scene import TRIANGLE_EMITTER, SceneData
 from warp_ir.lights.shape import (
     area_scale,
+    is_large,
+    large_light_pdf,
     light_axis,
     light_texture,
     modifier_row_of_light,
     modifier_row_of_surface,
     offset_from_light,
+    outward_normal,
+    point_radiance,
     unit_area,
     world_from_dome,
 )
 from warp_ir.lights.visibility import only_sampled
 from warp_ir.sampling.distribution2d import cell_direction, cell_uv, sample_cell, value_at_direction, value_at_uv
+from warp_ir.sampling.solid_angle import sample_solid_angle
 from warp_ir.sampling.square_to import square_to_cone, square_to_disk
 from warp_ir.scene import LightKind
 from warp_ir.surface import alpha_at, emission_at, offset_ray_origin, scene_at
@@ -44,6 +49,7 @@ class EmitterSample:
     pdf: float  # per area for a point, per solid angle for a direction; 0: rays cannot or must not hit the emitter
     emitter: int
     modifier_row: int  # of its `LightModifiers`; -1: none
+    large_pdf: float  # per area, if the light `is_large`: `pdf` even where rays must not hit the light; else 0
 
 
 @wp.struct
@@ -82,7 +88,10 @@ def sample_emitter_area(scene: SceneData, selection: EmitterSelection, u: wp.vec
     if kind == _TRIANGLE:
         out = _sample_triangle(scene, item, selection.probability, selection.u_remapped, u)
     elif kind <= _CYLINDER:
-        out = _sample_shape(scene, item, selection.probability, u)
+        if is_large(scene, item):
+            out = _sample_large(scene.address, item, selection.probability, selection.u_remapped, u)
+        else:
+            out = _sample_shape(scene, item, selection.probability, u)
     else:
         out = _sample_point_or_direction(scene, item, selection.probability, u)
     out.emitter = selection.emitter
@@ -169,6 +178,33 @@ def _sample_shape(scene: SceneData, light: int, probability: float, u: wp.vec2) 
     out.normal = wp.vec4(world_n[0], world_n[1], world_n[2], 0.0)
     out.intensity = radiance / out.pdf
     out.modifier_row = modifier_row_of_light(scene, light)
+    return out
+
+
+@wp.func(inline=False)
+def _sample_large(address: wp.uint64, light: int, probability: float, u_technique: float, u: wp.vec2) -> EmitterSample:
+    """A point on a light that is much larger than the scene: half by area, half by solid angle from the focus."""
+    scene = scene_at(address)[0]
+    out = _sample_shape(scene, light, probability, u)
+    if u_technique < 0.5:
+        sample = sample_solid_angle(
+            scene.light_kind[light],
+            scene.light_axes[light],
+            scene.light_inverse[light],
+            scene.light_origin[light] - scene.focus,
+            u,
+        )
+        out.intensity = wp.vec3(0.0)
+        if not sample.pdf > 0.0:
+            return out
+        n = outward_normal(scene, light, scene.focus + sample.offset)
+        p = offset_from_light(scene.focus + sample.offset, n)
+        out.position = wp.vec4(p[0], p[1], p[2], 1.0)
+        out.normal = wp.vec4(n[0], n[1], n[2], 0.0)
+    p = wp.vec3(out.position[0], out.position[1], out.position[2])
+    out.pdf = probability * large_light_pdf(scene, light, p)
+    out.intensity = point_radiance(scene, light, p) / out.pdf
+    out.large_pdf = out.pdf
     return out
 
 

@@ -6,10 +6,12 @@ from warp_ir.device_scene import SceneData
 from warp_ir.lights.sample_area import sample_emitter_area, select_emitter
 from warp_ir.lights.shape import (
     area_scale,
+    is_large,
     light_axis,
     light_texture,
     modifier_row_of_light,
     offset_from_light,
+    point_radiance,
     texture_uv,
     unit_area,
 )
@@ -37,12 +39,18 @@ class DirectSample:
 
 
 @wp.func
+def _by_solid_angle(scene: SceneData, light: int) -> bool:
+    """Whether a light with an area is sampled by solid angle, not by the radiance of its texture."""
+    return light_texture(scene, light) < 0 or is_large(scene, light)
+
+
+@wp.func
 def sample_direct(scene: SceneData, position: wp.vec3, u_emitter: float, u: wp.vec2) -> DirectSample:
     """Samples an emitter, and a direction from a point towards it: by solid angle if it is a shape, else by area."""
     selection = select_emitter(scene, u_emitter)
     item = scene.emitter_item[selection.emitter]
     out = DirectSample()
-    if scene.emitter_kind[selection.emitter] <= _CYLINDER and light_texture(scene, item) < 0:
+    if scene.emitter_kind[selection.emitter] <= _CYLINDER and _by_solid_angle(scene, item):
         sample = sample_solid_angle(
             scene.light_kind[item],
             scene.light_axes[item],
@@ -59,7 +67,7 @@ def sample_direct(scene: SceneData, position: wp.vec3, u_emitter: float, u: wp.v
         p = offset_from_light(position + sample.offset, outward)
         out.target = wp.vec4(p[0], p[1], p[2], 1.0)
         out.pdf = sample.pdf * selection.probability
-        out.radiance = scene.light_radiance[item] / out.pdf
+        out.radiance = point_radiance(scene, item, position + sample.offset) / out.pdf
         out.modifier_row = modifier_row_of_light(scene, item)
         if only_sampled(scene, out.modifier_row):
             out.pdf = 0.0
@@ -102,8 +110,7 @@ def shape_pdf(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3,
     """The pdf per solid angle with which `sample_direct` samples a direction that meets a light with an area at t."""
     kind = scene.light_kind[light]
     probability = selection_probability(scene, scene.light_emitter[light])
-    texture = light_texture(scene, light)
-    if texture < 0:
+    if _by_solid_angle(scene, light):
         to_light = scene.light_origin[light] - origin
         return probability * solid_angle_pdf(
             kind, scene.light_axes[light], scene.light_inverse[light], to_light, direction
@@ -111,6 +118,7 @@ def shape_pdf(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3,
     n = wp.vec3(0.0, 0.0, 1.0)  # only rectangles have textures
     cosine = -wp.dot(wp.normalize(wp.transpose(scene.light_inverse[light]) * n), direction)
     pdf = probability * t * t / (unit_area(kind) * area_scale(scene, light, n) * cosine)
+    texture = light_texture(scene, light)
     uv = texture_uv(scene, light, origin, direction, t)
     return pdf * uv_pdf(scene.light_tables[0].distributions, texture, uv)
 

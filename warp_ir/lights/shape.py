@@ -3,7 +3,8 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.sampling.distribution2d import value_at_uv
+from warp_ir.sampling.distribution2d import uv_pdf, value_at_uv
+from warp_ir.sampling.solid_angle import solid_angle_pdf
 from warp_ir.scene import LightKind
 
 wp.set_module_options({"enable_backward": False})
@@ -57,6 +58,53 @@ def unit_area(kind: int) -> float:
     if kind == _SPHERE:
         return 4.0 * wp.pi
     return 2.0 * wp.pi
+
+
+@wp.func
+def outward_normal(scene: SceneData, light: int, p: wp.vec3) -> wp.vec3:
+    """The unit normal of the emitting side of a light with an area at a point of it."""
+    kind = scene.light_kind[light]
+    n = wp.vec3(0.0, 0.0, 1.0)
+    if kind == _SPHERE or kind == _CYLINDER:
+        n = scene.light_inverse[light] * (p - scene.light_origin[light])
+        if kind == _CYLINDER:
+            n = wp.vec3(0.0, n[1], n[2])
+    return wp.normalize(wp.transpose(scene.light_inverse[light]) * n)
+
+
+@wp.func
+def is_large(scene: SceneData, light: int) -> bool:
+    """Whether a light is so much larger than the scene that half of its samples are by solid angle."""
+    return scene.large_light_count > 0 and scene.light_large[light] == 1
+
+
+@wp.func
+def large_light_pdf(scene: SceneData, light: int, p: wp.vec3) -> float:
+    """The pdf per area of the samples on a light that `is_large`, once it is selected, at a point of it."""
+    n = outward_normal(scene, light, p)
+    kind = scene.light_kind[light]
+    unit_n = wp.normalize(wp.transpose(scene.light_axes[light]) * n)
+    pdf = 0.5 / (unit_area(kind) * area_scale(scene, light, unit_n))
+    texture = light_texture(scene, light)
+    if texture >= 0:
+        pdf *= uv_pdf(scene.light_tables[0].distributions, texture, uv_of_point(scene, light, p))
+    to_light = p - scene.focus
+    squared = wp.dot(to_light, to_light) + 1.0e-30
+    direction = to_light / wp.sqrt(squared)
+    cosine = -wp.dot(n, direction)
+    if cosine > 0.0:
+        pdf += (
+            0.5
+            * solid_angle_pdf(
+                kind,
+                scene.light_axes[light],
+                scene.light_inverse[light],
+                scene.light_origin[light] - scene.focus,
+                direction,
+            )
+            * (cosine / squared)
+        )
+    return pdf
 
 
 @wp.func
@@ -131,8 +179,24 @@ def shape_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.
 @wp.func
 def texture_uv(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec2:
     """Texture coordinates in [0, 1]² where a ray meets a rectangle at t: u from +X to -X, v from +Y to -Y."""
-    q = scene.light_inverse[light] * (origin + t * direction - scene.light_origin[light])
+    return uv_of_point(scene, light, origin + t * direction)
+
+
+@wp.func
+def uv_of_point(scene: SceneData, light: int, p: wp.vec3) -> wp.vec2:
+    """Texture coordinates of a point of a rectangle."""
+    q = scene.light_inverse[light] * (p - scene.light_origin[light])
     return wp.vec2(0.5 - q[0], 0.5 - q[1])
+
+
+@wp.func
+def point_radiance(scene: SceneData, light: int, p: wp.vec3) -> wp.vec3:
+    """Radiance of a light with an area at a point of it, before shaping."""
+    texture = light_texture(scene, light)
+    if texture < 0:
+        return scene.light_radiance[light]
+    uv = uv_of_point(scene, light, p)
+    return wp.cw_mul(scene.light_radiance[light], value_at_uv(scene.light_tables[0].distributions, texture, uv))
 
 
 @wp.func

@@ -60,6 +60,23 @@ class Scene:
             return np.full(3, -0.5), np.full(3, 0.5)
         return np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
 
+    def balls(self) -> Floats:
+        """Bounding balls of the meshes of the world and of all copies of prototypes: x, y, z, radius; [n, 4]."""
+        out = [np.zeros((0, 4))]
+        for mesh, group in self._mesh_groups():
+            if not len(mesh.triangles):
+                continue
+            lower, upper = world_bounds(mesh, None)
+            centre, radius = 0.5 * (lower + upper), 0.5 * float(np.linalg.norm(upper - lower))
+            if group is None:
+                out.append(np.array([[*centre, radius]]))
+                continue
+            linear = group.matrices[:, :3, :3]
+            stretch = np.linalg.norm(linear, axis=(1, 2))  # at least the largest singular value
+            centres = linear @ centre + group.matrices[:, :3, 3]
+            out.append(np.concatenate([centres, radius * stretch[:, None]], axis=1))
+        return np.concatenate(out)
+
     @property
     def extent(self) -> float:
         """Diagonal of the bounding box in scene units, the reference for relative lengths."""

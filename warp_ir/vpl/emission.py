@@ -64,6 +64,8 @@ class VplBuffer:
     intensity: wp.array[wp.vec3]  # [W/sr]; [W/m²] where w = 0
     bounce: wp.array[wp.int32]  # reflections before the VPL; 0 on lights
     pdf_area: wp.array[wp.float32]  # [on_lights], area pdf of the point on the light; 0 where the light has no area
+    lifted: int  # 1: in an uneven scene, where `lift` is defined
+    lift: wp.array[wp.float32]  # factor of the weight with which a VPL is drawn
     modifiers: wp.array[wp.int32]  # [on_lights], row of the light's `LightModifiers`, or -1; one row if none has any
 
 
@@ -141,6 +143,10 @@ def _trace_light_path(
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
         vpls.bounce[i] = 0
         vpls.pdf_area[i] = scene.emitter_pdf_area[light.emitter]
+        if light.large_pdf > 0.0:
+            vpls.pdf_area[i] = light.large_pdf
+        if scene.uneven == 1:
+            vpls.lift[i] = scene.emitter_lift[light.emitter]
         if scene.modifier_count > 0:
             vpls.modifiers[i] = light.modifier_row
 
@@ -194,6 +200,8 @@ def _trace_light_path(
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
                     vpls.intensity[row] = intensity * _thinning_weight(settings, total)
                     vpls.bounce[row] = bounce
+                    if scene.uneven == 1:
+                        vpls.lift[row] = scene.emitter_lift[light.emitter]
         origin = hit.position
         u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
         direction = square_to_cosine_hemisphere(u, hit.normal)
@@ -220,6 +228,8 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
     target.normal[to] = source.normal[row]
     target.intensity[to] = source.intensity[row] * thinning_weight
     target.bounce[to] = source.bounce[row]
+    if source.lifted == 1:
+        target.lift[to] = source.lift[row]
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
@@ -337,6 +347,8 @@ def _buffer(scene: DeviceScene, scratch: Scratch, name: str, on_lights: int, on_
     vpls.intensity = scratch.array(name + ".intensity", rows, wp.vec3)
     vpls.bounce = scratch.array(name + ".bounce", rows, wp.int32)
     vpls.pdf_area = scratch.array(name + ".pdf_area", max(on_lights, 1), wp.float32)
+    vpls.lifted = scene.data.uneven
+    vpls.lift = scratch.array(name + ".lift", rows if scene.data.uneven else 1, wp.float32)
     modifiers = max(on_lights, 1) if scene.data.modifier_count > 0 else 1
     vpls.modifiers = scratch.array(name + ".modifiers", modifiers, wp.int32)
     return vpls

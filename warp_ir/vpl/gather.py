@@ -25,8 +25,8 @@ from warp_ir.vpl.sets import (
     SHAPING_ROWS,
     VplSets,
     bound_of,
+    draw_weight,
     intensity_and_bounce,
-    mean_channel,
     vec16,
     vec16i,
 )
@@ -184,7 +184,7 @@ def _shadowed_contribution(
             scene.light_tables[0].modifiers.rows[modifiers], x.position, position
         )
     intensity = wp.vec3(intensity_bounce[0], intensity_bounce[1], intensity_bounce[2])
-    return wp.cw_mul(intensity, visibility) * (per_ray / mean_channel(intensity))
+    return wp.cw_mul(intensity, visibility) * (per_ray / draw_weight(group, group.order[slot], intensity))
 
 
 @wp.func(inline=False)
@@ -315,7 +315,8 @@ def _vpl_weight(scene: SceneData, group: VplSets, x: ShadingPoint, slot: int) ->
     vpl = group.order[slot]
     normal = group.vpls.normal[vpl]
     bound = bound_of(group, vpl, normal)
-    weight = mean_channel(group.vpls.intensity[vpl]) * bounded_geometry_term(x, group.vpls.position[vpl], normal, bound)
+    weight = draw_weight(group, vpl, group.vpls.intensity[vpl])
+    weight *= bounded_geometry_term(x, group.vpls.position[vpl], normal, bound)
     if group.shaped == 1 and weight > 0.0:
         weight *= _vpl_shaping(scene, group, vpl, x.position)
     return weight

@@ -8,8 +8,10 @@ A `Guide` holds three kinds of probabilities. Samples are weighted by their inve
   of a VPL is its intensity times the `VplImportance` of the cell of positions and directions that it lies in.
 """
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
@@ -23,6 +25,7 @@ CELLS = 32
 _CELLS = wp.constant(CELLS)
 SIDES = 6
 """Number of directions of the normal that are told apart: the sides of a cube."""
+_MAX_ANNULI = 30
 MIN_SURVIVAL = 0.2
 """Least survival probability of a VPL: no weight grows by more than a factor of five."""
 _MIN_SURVIVAL = wp.constant(MIN_SURVIVAL)
@@ -80,10 +83,28 @@ class Guide:
 
 def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
     """A guide by which light paths start in proportion to power, and all VPLs survive."""
-    photon_target, importance = PhotonTarget(), VplImportance()
-    photon_target.focus, photon_target.cdf = (
-        launcher.empty(1, wp.vec4),
-        launcher.empty(1, wp.float32),
-    )
+    importance = VplImportance()
     importance.per_intensity = launcher.empty(1, wp.float32)
-    return Guide(scene, photon_target, importance)
+    return Guide(scene, _target_of_details(scene, launcher), importance)
+
+
+def _target_of_details(scene: DeviceScene, launcher: Launcher) -> PhotonTarget:
+    """The photon target of a view of which nothing is known: all of the scene, but half of it the ball of details."""
+    data, target = scene.data, PhotonTarget()
+    if data.focus_radius >= data.radius:
+        target.focus, target.cdf = launcher.empty(1, wp.vec4), launcher.empty(1, wp.float32)
+        return target
+    outer_radius = float(data.radius) + float(np.linalg.norm(np.subtract(data.focus, data.centre)))
+    annuli = annulus_count(scene, 1)
+    probabilities = np.full(annuli, 0.5 / annuli)
+    probabilities[0] += 0.5
+    rows = max(data.light_count, 1)
+    target.annulus_count = annuli
+    target.focus = launcher.array(np.tile([*data.focus, outer_radius], (rows, 1)), wp.vec4)
+    target.cdf = launcher.array(np.tile(np.concatenate([[0.0], np.cumsum(probabilities)]), rows), wp.float32)
+    return target
+
+
+def annulus_count(scene: DeviceScene, within_details: int) -> int:
+    """Number of annuli, each half as wide as the next, of which some are within the ball of details."""
+    return min(within_details + max(math.floor(math.log2(scene.data.radius / scene.data.focus_radius)), 0), _MAX_ANNULI)

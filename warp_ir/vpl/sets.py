@@ -60,9 +60,15 @@ class VplSets:
 
 
 @wp.func
-def mean_channel(intensity_bounce: wp.vec3) -> float:
-    """The mean of the channels. As a weight it need not be a luminance, but no channel may be left out."""
-    return (intensity_bounce[0] + intensity_bounce[1] + intensity_bounce[2]) * (1.0 / 3.0)
+def draw_weight(group: VplSets, vpl: int, intensity: wp.vec3) -> float:
+    """The weight with which a VPL is drawn, per bounded geometry term: its mean intensity, lifted in uneven scenes.
+
+    The mean of the channels need not be a luminance, but no channel may be left out.
+    """
+    weight = (intensity[0] + intensity[1] + intensity[2]) * (1.0 / 3.0)
+    if group.vpls.lifted == 1:
+        weight *= group.vpls.lift[vpl]
+    return weight
 
 
 @wp.func
@@ -186,7 +192,7 @@ def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
             vpl = group.order[slot]
             position = group.vpls.position[vpl]
             normal = group.vpls.normal[vpl]
-            mean_intensity = mean_channel(group.vpls.intensity[vpl])
+            mean_intensity = draw_weight(group, vpl, group.vpls.intensity[vpl])
             bound = bound_of(group, vpl, normal)
             group.intensity_bounce[slot] = intensity_and_bounce(group, slot)
         for k in range(4):
@@ -245,7 +251,7 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
         group.intensity_bounce = scratch.array(f"sets.{name}.intensity_bounce", max(LANES * most, 1), wp.vec4)
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
         group.shaping = scratch.array(f"sets.{name}.shaping", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
-    inputs = [lights, surfaces, scene.extent, guide.density_ratio, scene.area, keys, vpl_sets]
+    inputs = [lights, surfaces, scene.detail_extent, guide.density_ratio, scene.area, keys, vpl_sets]
     launcher.launch(_divide_into_sets, max(vpls.capacity, 1), inputs)  # also without VPLs: counts must become 0
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
     launcher.launch(_pack, sum(blocks), [vpl_sets])
