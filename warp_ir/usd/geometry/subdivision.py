@@ -103,14 +103,17 @@ def cage_normals(points: Floats, counts: Ints, indices: Ints, mask: Bools) -> Fl
     previous = np.empty_like(following)
     previous[following] = np.arange(len(following))
     corner = points[indices]
-    products = np.where(mask[face], corner_products(corner, following, previous), 0.0)
+    products = corner_products(corner, following, previous)
+    if not mask.all():
+        products[:, ~mask[face]] = 0.0
     if (counts > 3).any():
         first = following[last][np.cumsum(used)[face] - 1]
         # Newell's method: twice the area of a face along its normal, relative to its first vertex for precision.
-        (x, y, z), (u, v, w) = (corner - corner[first]).T, (corner[following] - corner[first]).T
+        relative = corner - corner[first]
+        (x, y, z), (u, v, w) = relative.T, relative[following].T
         doubled = (y * w - z * v, z * u - x * w, x * v - y * u)
         area = np.stack([np.bincount(face, weights=part, minlength=len(counts)) for part in doubled])
-        products = np.where(np.einsum("kv,kv->v", products, area[:, face]) < 0.0, -products, products)
+        products[:, np.einsum("kv,kv->v", products, area[:, face]) < 0.0] *= -1.0
     return unit_sums(products, indices, len(points))
 
 
