@@ -170,6 +170,7 @@ def test_what_is_in_focus_is_sharp(device):
     assert np.abs(pictures[0] - pictures[1]).max() <= 1 / 8 and np.mean(pictures[0] != pictures[1]) < 0.01
 
 
+@pytest.mark.extended
 def test_depth_of_field_can_be_declined():
     """Without it the picture is the pinhole's, bit for bit; an orthographic camera has no lens."""
     scene = ir.load_usd("scenes_usd/cornell_box.usda")

@@ -242,6 +242,7 @@ def test_interruption_while_importing(tmp_path, number, said, command):
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", f"warp-ir: {said}\n")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("stage", "code"), [(ROOM, 0), ("nowhere.usda", 2)])
 def test_the_process_ends_in_order(stage, code):
     """What others want done at the end is done, all output arrives, and the exit code is that of `main`."""
@@ -339,6 +340,7 @@ def test_out_of_memory_is_one_line(capsys, monkeypatch):
     assert "out of memory" in error_of(capsys, "info", ROOM, code=1)
 
 
+@pytest.mark.extended
 def test_native_libraries_keep_silent(tmp_path):
     """In a process of its own, too, an error is one line: Warp and USD print none of theirs."""
     process = warp_ir_process("render", ROOM, str(tmp_path / "a.png"), "--device", "cuda:77")
@@ -346,6 +348,7 @@ def test_native_libraries_keep_silent(tmp_path):
     assert (process.returncode, out, err.count("\n")) == (2, "", 1), err
 
 
+@pytest.mark.extended
 def test_closed_pipe():
     """`warp-ir info … | head -0` is no error worth a traceback."""
     read, write = os.pipe()
@@ -409,6 +412,7 @@ COMPARE = ["--width", "8", "--light-paths", "16", "--device", "cpu", "--times", 
 ROW = r"(\S.*?)  +([\d.e-]+)  +(\d+)  +(<?) ?([\d.e-]+)  +([+-][\d.]+) %"
 
 
+@pytest.mark.extended
 def test_compare_prints_a_table(tmp_path, capsys):
     """The table, the recommendation and the JSON say the same; a method is judged against `path` of another seed."""
     command = ["compare", ROOM, "--json", str(tmp_path / "c.json"), *COMPARE, "--methods", "path,vpl", "--seed", "7"]

@@ -127,7 +127,7 @@ def resources(cubin):
 def test_chosen_vpls_have_room():
     """A thread without lanes keeps the VPLs it has chosen in an array of eight."""
     how = warp_ir.estimators.vpl
-    assert max(*how._SHADOW_RAYS, *how._SHADOW_RAYS_AFTER) <= warp_ir.vpl.gather._MOST_RAYS
+    assert max(*how._SHADOW_RAYS, *how._COMPENSATION_SHADOW_RAYS) <= warp_ir.vpl.gather._MAX_RAYS
 
 
 READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")

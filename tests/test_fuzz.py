@@ -48,6 +48,7 @@ def _outcomes(folder, sources, seeds):
     return [re.fullmatch(r"(\S+) (\S+) (\S+) (.*)", line).groups() for line in said]
 
 
+@pytest.mark.extended
 def test_the_unharmed_sources_load(tmp_path, sources):
     """What is mutated is sound: every source is a scene with triangles, without skipped prims."""
     for source in sources:

@@ -95,6 +95,7 @@ def test_readme_programs_run(tmp_path, monkeypatch):
     assert (tmp_path / "cornell.exr").is_file()
 
 
+@pytest.mark.extended
 def test_api_examples_run(tmp_path, monkeypatch):
     """The examples run one after the other, and there is one of every public name."""
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")

@@ -48,6 +48,7 @@ def _world_points(mesh):
     return np.array(mesh.GetPointsAttr().Get(), dtype=np.float64) @ matrix[:3, :3] + matrix[3, :3]
 
 
+@pytest.mark.extended
 def test_committed_files_are_what_the_script_writes(written):
     """Byte for byte; textures pixel for pixel, since PNG compressors differ."""
     committed = {path.relative_to(FOLDER) for path in FOLDER.rglob("*") if path.is_file()}

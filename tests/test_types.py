@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import warp_ir as ir
 
 ROOT = Path(__file__).parent.parent
@@ -44,6 +46,7 @@ def check(tmp_path, text):
     return re.findall(r"^program\.py:(\d+): error: .*\[([a-z-]+)\]$", out.stdout, flags=re.MULTILINE)
 
 
+@pytest.mark.extended
 def test_type_checkers_see_every_public_name(tmp_path):
     """The documented program, which uses every public name, has no type errors; misspelt and wrong uses have."""
     assert all(f"ir.{name}" in PROGRAM for name in ir.__all__)

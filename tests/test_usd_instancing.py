@@ -549,6 +549,7 @@ def write_many(path: Path, count: int) -> None:
     stage.GetRootLayer().Save()
 
 
+@pytest.mark.extended
 def test_many_instances_take_the_memory_of_their_places(tmp_path):
     """A hundred thousand instances are an array of matrices and one of colours: 140 bytes each."""
     write_many(tmp_path / "many.usdc", 100_000)

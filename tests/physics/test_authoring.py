@@ -150,6 +150,7 @@ def test_authoring_changes_only_rounding(tmp_path, plain, other):
     assert different.mean() <= 0.01
 
 
+@pytest.mark.extended
 def test_the_up_axis_changes_only_the_noise(tmp_path):
     """The scene with Z up is the same picture within its standard errors, pixel by pixel.
 
