@@ -202,7 +202,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     settings = ir.RenderSettings(width=width, height=width)
     camera = camera_data(scene.camera, uploaded.frame, settings)
     gbuffer, _ = new_gbuffer(
-        launcher, width, width, has_normal_maps=uploaded.data.normal_map_count > 0, has_emission=True
+        launcher, width, width, has_normals=False, has_normal_maps=uploaded.data.normal_map_count > 0, has_emission=True
     )
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
@@ -241,7 +241,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     side = max(1, width // 4)  # a smaller picture, because brute force is slow
     small = camera_data(scene.camera, uploaded.frame, ir.RenderSettings(width=side, height=side))
     gbuffer, _ = new_gbuffer(
-        launcher, side, side, has_normal_maps=uploaded.data.normal_map_count > 0, has_emission=True
+        launcher, side, side, has_normals=False, has_normal_maps=uploaded.data.normal_map_count > 0, has_emission=True
     )
     trace_primary(uploaded, small, launcher, gbuffer, iteration=0, seed=0)
     out = launcher.empty(side * side, wp.vec3)

@@ -125,6 +125,11 @@ def normal_mapped():
     return ir.Scene(furnace(level=1).meshes, (ir.Material("m", normal_texture=normals),))
 
 
+def smooth():
+    (ball,) = furnace(level=1).meshes
+    return ir.Scene((replace(ball, normals=ball.points[ball.triangles].astype(np.float32)),))
+
+
 def through_a_lens():
     scene = lamps()
     return replace(scene, camera=replace(scene.camera, lens_radius=0.1, focus_distance=1.0))
@@ -133,8 +138,8 @@ def through_a_lens():
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "scene",
-    [cornell_box(), lamps(), normal_mapped(), through_a_lens(), moving()],
-    ids=["visible emission", "lamps", "normal map", "lens", "moving"],
+    [cornell_box(), lamps(), normal_mapped(), smooth(), through_a_lens(), moving()],
+    ids=["visible emission", "lamps", "normal map", "normals", "lens", "moving"],
 )
 @pytest.mark.parametrize("settings", [{}, {"filter": False}, {"estimator": "path"}, {"visible_lights": True}], ids=str)
 def test_bytes_per_pixel(scene, settings, monkeypatch):

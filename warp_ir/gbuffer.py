@@ -12,7 +12,7 @@ from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.lights import emission_to_camera, intersect_lights
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_disk
-from warp_ir.surface import Hit, albedo, closest, mapped_normal, shading_normal, terminator_offset
+from warp_ir.surface import Hit, ShadingPoint, albedo, closest, mapped_normal, shading_normal, smooth_height
 from warp_ir.tiles import Tiles, all_tiles, indices, pixel_at, skipped_iterations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -35,15 +35,16 @@ class GBuffer:
     """What the camera sees and how it is lit: one row per pixel, row by row from the top left, in the device frame."""
 
     mesh: wp.array[wp.int32]  # index into Scene.meshes; -1: background
-    position: wp.array[wp.vec3]  # off the (smooth) surface: where shadow rays start
-    normal_or_direct: wp.array[wp.vec3]  # the normal that bounds the lit side, geometric or of the smooth surface;
-    # the estimator replaces it by the direct irradiance over π, which needs no memory of its own
+    position: wp.array[wp.vec3]  # off the surface, on the side of its normal
+    normal_or_direct: wp.array[wp.vec3]  # the geometric normal; the estimator replaces it by the direct irradiance
+    # over π, which needs no memory of its own
     indirect: wp.array[wp.vec3]  # irradiance over π from VPLs on surfaces or by further bounces, from the estimator
     shading_normal: wp.array[wp.vec3]
     smooth_normal: wp.array[wp.vec3]  # the shading normal without normal maps: the filter tells surfaces apart by it
     albedo: wp.array[wp.vec3]
     emission: wp.array[wp.vec3]  # radiance that reaches the camera unreflected; empty: nothing in view can emit
     depth: wp.array[wp.float32]  # distance along the camera's -Z
+    smooth_height: wp.array[wp.float32]  # of `ShadingPoint`; empty if no mesh has normals
     surface_point: wp.array[SurfacePoint]  # empty if no surface moves while the shutter is open
     tiles: Tiles  # the pixels of this iteration; the rows of other pixels are undefined
 
@@ -110,6 +111,7 @@ class CameraHit:
     albedo: wp.vec3
     emission: wp.vec3
     depth: float
+    smooth_height: float
     hit: Hit  # from which the other fields were computed
 
 
@@ -164,10 +166,7 @@ def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHi
         hit_record.position = hit.position
         hit_record.normal = hit.normal
         hit_record.shading_normal = shading_normal(scene, hit)
-        offset = terminator_offset(scene, hit)
-        if wp.length_sq(offset) > 0.0:
-            hit_record.position += offset
-            hit_record.normal = hit_record.shading_normal
+        hit_record.smooth_height = smooth_height(scene, hit, hit_record.shading_normal)
         hit_record.depth = hit.t + near
         pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
         pixel *= wp.where(camera.orthographic == 1, 1.0, hit_record.depth)
@@ -228,6 +227,8 @@ def _trace_primary(
     if gbuffer.emission.shape[0] > 0:
         gbuffer.emission[pixel] = hit_record.emission
     gbuffer.depth[pixel] = hit_record.depth
+    if gbuffer.smooth_height.shape[0] > 0:
+        gbuffer.smooth_height[pixel] = hit_record.smooth_height
     if gbuffer.surface_point.shape[0] > 0:
         gbuffer.surface_point[pixel] = surface_point_of(hit_record.hit)
 
@@ -248,11 +249,29 @@ def reflecting_pixel(gbuffer: GBuffer, index: int) -> int:
     return pixel
 
 
+@wp.func
+def camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
+    """The point that the camera sees at a pixel, before the estimator replaces its normal."""
+    x = ShadingPoint()
+    x.position = gbuffer.position[pixel]
+    x.geometric_normal = gbuffer.normal_or_direct[pixel]
+    x.normal = x.geometric_normal
+    if gbuffer.smooth_height.shape[0] > 0:
+        x.smooth_height = gbuffer.smooth_height[pixel]
+        if x.smooth_height > 0.0:
+            x.normal = gbuffer.smooth_normal[pixel]
+    x.shading_normal = gbuffer.shading_normal[pixel]
+    x.mesh = gbuffer.mesh[pixel]
+    x.from_camera = True
+    return x
+
+
 def new_gbuffer(
     launcher: Launcher,
     columns: int,
     rows: int,
     *,
+    has_normals: bool,
     has_normal_maps: bool,
     has_emission: bool,
     moving: bool = False,
@@ -266,6 +285,7 @@ def new_gbuffer(
         launcher: Where to allocate.
         columns: Pixels across.
         rows: Pixels down.
+        has_normals: Whether any mesh has normals.
         has_normal_maps: Whether the scene has normal maps.
         has_emission: Whether the camera may see anything that emits.
         moving: Whether surfaces move while the shutter is open.
@@ -273,12 +293,13 @@ def new_gbuffer(
     """
     vectors = ["position", "normal_or_direct", "indirect", "shading_normal", "albedo"]
     vectors += ["smooth_normal"] * has_normal_maps + ["emission"] * has_emission
-    types = [*[wp.vec3] * len(vectors), wp.int32, wp.float32]
+    types = [*[wp.vec3] * len(vectors), wp.int32, *[wp.float32] * (1 + has_normals)]
     pixels = columns * rows
     block = launcher.empty(pixels * max(float_count(*types), spare), wp.float32)
-    *arrays, mesh, depth = partition(block, pixels, types)
+    arrays = partition(block, pixels, types)
     gbuffer = GBuffer()
-    gbuffer.mesh, gbuffer.depth = mesh, depth
+    gbuffer.smooth_height = arrays.pop() if has_normals else launcher.empty(0, wp.float32)
+    gbuffer.depth, gbuffer.mesh = arrays.pop(), arrays.pop()
     gbuffer.tiles = all_tiles(columns, rows, launcher)
     for name, array in zip(vectors, arrays, strict=True):
         setattr(gbuffer, name, array)

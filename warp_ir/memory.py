@@ -51,7 +51,8 @@ def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
     """
     emission = _VEC3 * (scene.glows or settings.visible_lights)
     smooth_normal = _VEC3 * any(material.normal_texture is not None for material in scene.materials)
-    iteration = sum(_ITERATION.values()) + emission + smooth_normal
+    smooth_height = _FLOAT * scene.has_normals
+    iteration = sum(_ITERATION.values()) + emission + smooth_normal + smooth_height
     film = sum(_FILM.values()) + emission + _INT * settings.visible_lights
     host_picture = _VEC3
     if not settings.filter or settings.estimator != "vpl":

@@ -205,6 +205,7 @@ class Renderer:
         layout = _BufferLayout(
             columns=camera.columns,
             rows=camera.rows,
+            normals=any(sample.has_normals for sample in scenes),
             normal_maps=any(each.data.normal_map_count > 0 for each in uploaded),
             emission=settings.visible_lights or any(sample.glows for sample in scenes),
             moving=settings.filter and surfaces_move(uploaded),
@@ -261,6 +262,7 @@ class _BufferLayout:
 
     columns: int
     rows: int
+    normals: bool
     normal_maps: bool
     emission: bool
     moving: bool
@@ -272,6 +274,7 @@ class _BufferLayout:
             launcher,
             self.columns,
             self.rows,
+            has_normals=self.normals,
             has_normal_maps=self.normal_maps,
             has_emission=self.emission,
             moving=self.moving,

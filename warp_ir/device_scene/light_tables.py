@@ -78,8 +78,9 @@ def upload_lights(
     data.light_tables = launcher.array([tables], LightTables)
 
     shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
-    reach = np.abs(axes[shapes]).sum(axis=2) * 1.001 if shapes else np.zeros((1, 3))
     centre = origin[shapes] if shapes else np.full((1, 3), 1.0e6)
+    # Larger than the shape by more than rounding: rays must reach the box of a lamp that lies in a surface before it.
+    reach = np.abs(axes[shapes]).sum(axis=2) * 1.001 + np.abs(centre) * 2.0**-18 if shapes else np.zeros((1, 3))
     data.shape_count = len(shapes)
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))

@@ -28,7 +28,7 @@ import warp_ir.vpl.emission
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, reflecting_pixel, trace_primary
+from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
 from warp_ir.lights import light_visibility
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.settings import ResolvedSettings
@@ -70,16 +70,15 @@ def _accumulate(
         return
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    position = gbuffer.position[pixel]
-    normal = gbuffer.normal_or_direct[pixel]
+    x = camera_vertex(gbuffer, pixel)
     for k in range(vpls.count[0]):
-        g = geometry_term(position, normal, gbuffer.shading_normal[pixel], vpls.position[k], vpls.normal[k])
+        g = geometry_term(x.position, x.normal, x.shading_normal, vpls.position[k], vpls.normal[k])
         if g > 0.0:
             modifiers = int(-1)
             if scene.modifier_count > 0 and k < vpls.on_lights:
                 modifiers = vpls.modifiers[k]
             # V, and the light's shaping and links if it has any.
-            visibility = light_visibility(scene, modifiers, position, gbuffer.mesh[pixel], True, vpls.position[k])
+            visibility = light_visibility(scene, modifiers, x, vpls.position[k])
             irradiance = wp.cw_mul(vpls.intensity[k], visibility) * wp.min(g, bound)
             if vpls.bounce[k] == 0:
                 direct += irradiance

@@ -26,16 +26,16 @@ import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, reflecting_pixel, trace_primary
+from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
 from warp_ir.guiding import guiding_applies, learn
 from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
-from warp_ir.surface import albedo, closest
+from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin
 from warp_ir.tiles import indices
 from warp_ir.vpl.emission import emit_vpls
-from warp_ir.vpl.gather import ShadingPoint, gather
+from warp_ir.vpl.gather import gather
 from warp_ir.vpl.guide import Guide, unguided
 from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, build_sets
 
@@ -78,18 +78,6 @@ def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
     return _spread(column) | (_spread(row) << 1)
 
 
-@wp.func
-def _camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
-    """The point that the camera sees at a pixel."""
-    x = ShadingPoint()
-    x.position = gbuffer.position[pixel]
-    x.normal = gbuffer.normal_or_direct[pixel]
-    x.shading_normal = gbuffer.shading_normal[pixel]
-    x.mesh = gbuffer.mesh[pixel]
-    x.from_camera = True
-    return x
-
-
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _gather_pixels(
     first: int,
@@ -107,7 +95,7 @@ def _gather_pixels(
     index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
     # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
     u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
-    x = _camera_vertex(gbuffer, pixel)
+    x = camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
     radius = 1.0 / wp.sqrt(bound.minimum)  # length of compensation rays: farther away G cannot exceed the bound
@@ -129,17 +117,16 @@ def _gather_pixels(
         if wp.dot(direction, x.normal) <= 0.0:
             break
         cosine = wp.dot(direction, x.shading_normal)
-        hit = closest(scene, x.position, direction, radius)
+        origin = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
+        hit = closest(scene, origin, direction, radius)
         t_max = wp.where(hit.triangle < 0, radius, hit.t)
-        emitted = clamped_light_radiance(
-            scene, x.position, direction, t_max, cosine, bound, radius, x.mesh, x.from_camera
-        )
+        emitted = clamped_light_radiance(scene, x, direction, t_max, cosine, bound, radius)
         clamped = float(0.0)
         if hit.triangle >= 0:
-            g = -wp.dot(hit.normal, direction) * cosine / (hit.t * hit.t)
-            clamped = clamped_fraction(bound.minimum, g)
+            g = geometry_term_of_hit(x, direction, hit)
+            clamped = clamped_fraction(bound.minimum, g[0]) * g[1]
             if clamped > 0.0:
-                emitted += clamped_surface_radiance(scene, hit, direction, g, bound, x.mesh)
+                emitted += clamped_surface_radiance(scene, hit, direction, g[0], bound, x.mesh) * g[1]
         emitted = wp.cw_mul(throughput, emitted) * wp.pi
         if depth == 0:
             direct += emitted
@@ -153,11 +140,7 @@ def _gather_pixels(
             if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
                 break
             throughput = throughput / survival
-        x.position = hit.position
-        x.normal = hit.normal
-        x.shading_normal = hit.normal
-        x.mesh = scene.triangle_mesh[hit.triangle]
-        x.from_camera = False
+        x = shading_point(scene, hit)
         rays = settings.compensation_rays
         depth += 1
     gbuffer.normal_or_direct[pixel] = direct / wp.pi

@@ -10,12 +10,12 @@ import warp as wp
 from warp_ir.device.launcher import MAX_REGISTERS, Launcher, copy_record
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, new_gbuffer, trace_primary
+from warp_ir.gbuffer import GBuffer, camera_vertex, new_gbuffer, trace_primary
 from warp_ir.lights import light_visibility, sample_direct, select_emitter
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
-from warp_ir.surface import albedo, closest, visible
+from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin, visible
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import CELLS, Guide, cell_of
 
@@ -64,45 +64,40 @@ def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scrambl
         rows.emitter[row] = -1
         rows.score[row] = 0.0
         rows.weight[row] = 0.0
-    position = gbuffer.position[i]
-    normal = gbuffer.normal_or_direct[i]
-    shading_normal = gbuffer.shading_normal[i]
+    x = camera_vertex(gbuffer, i)
     throughput = gbuffer.albedo[i]
-    mesh = gbuffer.mesh[i]
     k = int(0)
-    while k < _VERTEX_COUNT and mesh >= 0 and wp.max(throughput) > 0.0:
+    while k < _VERTEX_COUNT and x.mesh >= 0 and wp.max(throughput) > 0.0:
         dimension = _FIRST_DIMENSION + _DIMENSIONS * k
         for j in range(_EMITTER_SAMPLE_COUNT):
             row = (i * _VERTEX_COUNT + k) * _EMITTER_SAMPLE_COUNT + j
             sample = i * _EMITTER_SAMPLE_COUNT + j
             u_emitter = sobol.sample_1d(scene.sobol, sample, dimension, scramble)
             u = sobol.sample_2d(scene.sobol, sample, dimension + 1, scramble)
-            light = sample_direct(scene, position, u_emitter, u)
+            light = sample_direct(scene, x.position, u_emitter, u)
             rows.emitter[row] = select_emitter(scene, u_emitter).emitter
-            rows.position[row] = position
-            rows.normal[row] = shading_normal
+            rows.position[row] = x.position
+            rows.normal[row] = x.shading_normal
             rows.target[row] = light.target
             rows.weight[row] = (throughput[0] + throughput[1] + throughput[2]) * (1.0 / 3.0)
-            cosine = wp.dot(shading_normal, light.direction)
-            if cosine > 0.0 and wp.dot(normal, light.direction) > 0.0 and wp.max(light.radiance) > 0.0:
-                visibility = light_visibility(scene, light.modifier_row, position, mesh, k == 0, light.target)
+            cosine = wp.dot(x.shading_normal, light.direction)
+            if cosine > 0.0 and wp.dot(x.normal, light.direction) > 0.0 and wp.max(light.radiance) > 0.0:
+                visibility = light_visibility(scene, light.modifier_row, x, light.target)
                 contribution = wp.cw_mul(throughput, wp.cw_mul(light.radiance, visibility)) * (cosine / wp.pi)
                 rows.score[row] = (contribution[0] + contribution[1] + contribution[2]) * (1.0 / 3.0)
 
         direction = square_to_cosine_hemisphere(
-            sobol.sample_2d(scene.sobol, i, dimension + 3, scramble), shading_normal
+            sobol.sample_2d(scene.sobol, i, dimension + 3, scramble), x.shading_normal
         )
-        hit = closest(scene, position, direction, 3.0e38)
-        if hit.triangle < 0 or wp.dot(direction, normal) <= 0.0:
+        origin = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
+        hit = closest(scene, origin, direction, 3.0e38)
+        if hit.triangle < 0 or wp.dot(direction, x.normal) <= 0.0:
             break
         rho = albedo(scene, hit, scene.footprint)
         if sobol.sample_1d(scene.sobol, i, dimension + 5, scramble) >= wp.max(rho):
             break
-        throughput = wp.cw_mul(throughput, rho) / wp.max(rho)
-        position = hit.position
-        normal = hit.normal
-        shading_normal = hit.normal
-        mesh = scene.triangle_mesh[hit.triangle]
+        throughput = wp.cw_mul(throughput, rho) / wp.max(rho) * geometry_term_of_hit(x, direction, hit)[1]
+        x = shading_point(scene, hit)
         k += 1
 
 
@@ -139,7 +134,12 @@ def trace_camera_probes(
     paths = whole.columns * whole.rows
     scramble = sobol.iteration_scramble(settings.seed, _CAMERA_PATHS)
     gbuffer, _ = new_gbuffer(
-        launcher, whole.columns, whole.rows, has_normal_maps=scene.data.normal_map_count > 0, has_emission=False
+        launcher,
+        whole.columns,
+        whole.rows,
+        has_normals=scene.source.has_normals,
+        has_normal_maps=scene.data.normal_map_count > 0,
+        has_emission=False,
     )
     trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
     n = paths * _MAX_VERTICES * _EMITTER_SAMPLES

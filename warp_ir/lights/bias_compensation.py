@@ -8,6 +8,7 @@ from warp_ir.lights.shape import (
     intersect_shape,
     is_large,
     large_light_pdf,
+    meets_before,
     modifier_row_of_light,
     modifier_row_of_surface,
     shape_radiance,
@@ -20,7 +21,7 @@ from warp_ir.lights.visibility import (
     only_sampled,
     shaping_at,
 )
-from warp_ir.surface import Hit, closest, emission, scene_at
+from warp_ir.surface import Hit, ShadingPoint, closest, emission, scene_at, shadow_ray_origin
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,49 +51,42 @@ def clamped_fraction(bound: float, g: float) -> float:
 @wp.func
 def clamped_light_radiance(
     scene: SceneData,
-    origin: wp.vec3,
+    x: ShadingPoint,
     direction: wp.vec3,
     t_max: float,
     cosine: float,
     bound: Bound,
     max_distance: float,
-    mesh: int,
-    from_camera: bool,
 ) -> wp.vec3:
     """Radiance of the lights that a unit direction hits, times the fraction that the bound removes.
 
     Args:
         scene: The scene.
-        origin: A point of a mesh, off its surface.
+        x: The point that the direction leaves.
         direction: A unit direction.
         t_max: Distance to the first surface, or `max_distance`.
-        cosine: Cosine of the direction to the normal at the origin.
+        cosine: Cosine of the direction to the shading normal.
         bound: The bound on G.
         max_distance: Distance beyond which G cannot exceed the bound; `only_sampled` lights count up to there.
-        mesh: The mesh of the origin.
-        from_camera: Whether the camera sees the origin.
     """
     if scene.shape_count > 0 or scene.modifier_count > 0:
-        return _clamped_light_radiance(
-            scene.address, origin, direction, t_max, cosine, bound, max_distance, mesh, from_camera
-        )
+        return _clamped_light_radiance(scene.address, x, direction, t_max, cosine, bound, max_distance)
     return wp.vec3(0.0)
 
 
 @wp.func(inline=False)
 def _clamped_light_radiance(
     address: wp.uint64,
-    origin: wp.vec3,
+    x: ShadingPoint,
     direction: wp.vec3,
     t_max: float,
     cosine: float,
     bound: Bound,
     max_distance: float,
-    mesh: int,
-    from_camera: bool,
 ) -> wp.vec3:
     """`clamped_light_radiance` as a called function."""
     scene = scene_at(address)[0]
+    origin = x.position
     total = wp.vec3(0.0)
     if scene.shape_count > 0:
         query = wp.bvh_query_ray(scene.shape_bvh, origin, direction)
@@ -100,7 +94,9 @@ def _clamped_light_radiance(
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
             hit = intersect_shape(scene, light, origin, direction)
-            if hit[3] > 0.0 and hit[3] < t_max and may_intersect(scene, modifier_row_of_light(scene, light), mesh, 0.0):
+            if meets_before(scene, light, origin, direction, hit, t_max) and may_intersect(
+                scene, modifier_row_of_light(scene, light), x.mesh, 0.0
+            ):
                 fraction = _light_clamped_fraction(scene, light, hit, origin, direction, cosine, bound)
                 if fraction > 0.0:
                     radiance = shape_radiance(scene, light, origin, direction, hit[3])
@@ -116,39 +112,29 @@ def _clamped_light_radiance(
             fraction = _light_clamped_fraction(scene, light, hit, origin, direction, cosine, bound)
             if fraction > 0.0:
                 p = origin + direction * (hit[3] * 0.99999)
-                visibility = light_visibility(
-                    scene,
-                    modifier_row_of_light(scene, light),
-                    origin,
-                    mesh,
-                    from_camera,
-                    wp.vec4(p[0], p[1], p[2], 1.0),
-                )
+                target = wp.vec4(p[0], p[1], p[2], 1.0)
+                visibility = light_visibility(scene, modifier_row_of_light(scene, light), x, target)
                 total += wp.cw_mul(shape_radiance(scene, light, origin, direction, hit[3]), visibility) * fraction
     if scene.modifier_count > 0:
         if scene.light_tables[0].modifiers.only_sampled_mesh_count > 0:
-            total += _clamped_only_sampled_surfaces(
-                scene.address, origin, direction, cosine, bound, max_distance, mesh, from_camera
-            )
+            total += _clamped_only_sampled_surfaces(scene.address, x, direction, cosine, bound, max_distance)
     return total
 
 
 @wp.func(inline=False)
 def _clamped_only_sampled_surfaces(
     address: wp.uint64,
-    origin: wp.vec3,
+    x: ShadingPoint,
     direction: wp.vec3,
     cosine: float,
     bound: Bound,
     max_distance: float,
-    mesh: int,
-    from_camera: bool,
 ) -> wp.vec3:
     """As `clamped_light_radiance`, for all `only_sampled` emissive surfaces along the ray, whatever hides them."""
     scene = scene_at(address)[0]
     total = wp.vec3(0.0)
-    start = origin
-    distance_to_start = float(0.0)
+    start = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
+    distance_to_start = wp.dot(start - x.position, direction)
     for _ in range(CROSSINGS):
         hit = closest(scene, start, direction, max_distance - distance_to_start)
         if hit.triangle < 0:
@@ -162,9 +148,9 @@ def _clamped_only_sampled_surfaces(
             )
             if fraction > 0.0 and wp.max(radiance) > 0.0:
                 target = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
-                total += wp.cw_mul(radiance, light_visibility(scene, row, origin, mesh, from_camera, target)) * fraction
+                total += wp.cw_mul(radiance, light_visibility(scene, row, x, target)) * fraction
         start = continue_behind(scene, hit, direction)
-        distance_to_start = wp.dot(start - origin, direction)
+        distance_to_start = wp.dot(start - x.position, direction)
     return total
 
 

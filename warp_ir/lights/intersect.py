@@ -9,6 +9,7 @@ from warp_ir.lights.shape import (
     intersect_shape,
     light_axis,
     light_texture,
+    meets_before,
     modifier_row_of_light,
     modifier_row_of_surface,
     shape_radiance,
@@ -52,10 +53,8 @@ def _intersect_lights(
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
             hit = intersect_shape(scene, light, origin, direction)
-            if (
-                hit[3] > 0.0
-                and hit[3] < t_max
-                and may_intersect(scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf)
+            if meets_before(scene, light, origin, direction, hit, t_max) and may_intersect(
+                scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf
             ):
                 radiance = shape_radiance(scene, light, origin, direction, hit[3])
                 radiance = wp.cw_mul(radiance, shaping_at(scene, modifier_row_of_light(scene, light), -direction))

@@ -6,6 +6,7 @@ from warp_ir.device_scene import SceneData
 from warp_ir.sampling.distribution2d import uv_pdf, value_at_uv
 from warp_ir.sampling.solid_angle import solid_angle_pdf
 from warp_ir.scene import LightKind
+from warp_ir.surface import SHADOW_RAY_END
 
 wp.set_module_options({"enable_backward": False})
 
@@ -164,6 +165,21 @@ def intersect_shape(scene: SceneData, light: int, origin: wp.vec3, direction: wp
         return miss
     n = wp.normalize(o2 + t * d2)
     return wp.vec4(n[0], n[1], n[2], t)
+
+
+@wp.func
+def meets_before(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, hit: wp.vec4, t_max: float) -> bool:
+    """Whether a ray in a unit direction meets a light before a surface at `t_max`; `hit` is from `intersect_shape`.
+
+    A light in the plane of a surface counts, as it does for shadow rays: these end before the light, off its side.
+    """
+    if hit[3] <= 0.0:
+        return False
+    if hit[3] < t_max:
+        return True
+    normal = wp.normalize(wp.transpose(scene.light_inverse[light]) * wp.vec3(hit[0], hit[1], hit[2]))
+    p = offset_from_light(origin + direction * hit[3], normal)
+    return SHADOW_RAY_END * wp.dot(p - origin, normal) > t_max * wp.dot(direction, normal)
 
 
 @wp.func

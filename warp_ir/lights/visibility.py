@@ -7,7 +7,16 @@ import warp as wp
 
 from warp_ir.device_scene import SceneData
 from warp_ir.light_modifiers import in_link_set, shaping_factor
-from warp_ir.surface import Hit, closest, scene_at, spawn_ray_origin, visible
+from warp_ir.surface import (
+    SHADOW_RAY_END,
+    Hit,
+    ShadingPoint,
+    closest,
+    scene_at,
+    shadow_ray_origin,
+    spawn_ray_origin,
+    visible,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,44 +54,39 @@ def may_intersect(scene: SceneData, row: int, mesh: int, bsdf_pdf: float) -> boo
 
 
 @wp.func
-def light_visibility(
-    scene: SceneData, modifier_row: int, position: wp.vec3, mesh: int, from_camera: bool, target: wp.vec4
-) -> wp.vec3:
-    """The fraction of the radiance of a point on a light that reaches a point of a mesh.
+def light_visibility(scene: SceneData, modifier_row: int, x: ShadingPoint, target: wp.vec4) -> wp.vec3:
+    """The fraction of the radiance of a point on a light that reaches a shading point.
 
     Args:
         scene: The scene.
         modifier_row: Row of the light's `LightModifiers`; -1: only visibility counts.
-        position: The receiving point, off its surface.
-        mesh: The mesh of the receiving point.
-        from_camera: Whether the camera sees the receiving point: only there may a light cast no shadows.
+        x: The receiving point. Only where the camera sees it may a light cast no shadows.
         target: The point on the light, homogeneous and off its surface.
     """
     if modifier_row >= 0:
-        return _modified_visibility(scene.address, modifier_row, position, mesh, from_camera, target)
-    if visible(scene, position, target):
+        return _modified_visibility(scene.address, modifier_row, x, target)
+    if visible(scene, shadow_ray_origin(x, target), target):
         return wp.vec3(1.0)
     return wp.vec3(0.0)
 
 
 @wp.func(inline=False)
-def _modified_visibility(
-    address: wp.uint64, row: int, position: wp.vec3, mesh: int, from_camera: bool, target: wp.vec4
-) -> wp.vec3:
+def _modified_visibility(address: wp.uint64, row: int, x: ShadingPoint, target: wp.vec4) -> wp.vec3:
     """`light_visibility` for a light with a row of `LightModifiers`."""
     scene = scene_at(address)[0]
     modifiers = scene.light_tables[0].modifiers.rows[row]
-    to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
+    to_light = wp.vec3(target[0], target[1], target[2]) - x.position * target[3]
     factor = shaping_factor(modifiers, scene.light_tables[0].distributions, -wp.normalize(to_light))
-    if wp.max(factor) <= 0.0 or in_link_set(scene.light_tables[0].modifiers, modifiers.unlit, mesh):
+    if wp.max(factor) <= 0.0 or in_link_set(scene.light_tables[0].modifiers, modifiers.unlit, x.mesh):
         return wp.vec3(0.0)
-    if from_camera and modifiers.shadows == 0:
+    if x.from_camera and modifiers.shadows == 0:
         return factor
+    origin = shadow_ray_origin(x, target)
     if modifiers.shadowless < 0:
-        if visible(scene, position, target):
+        if visible(scene, origin, target):
             return factor
         return wp.vec3(0.0)
-    if _visible_ignoring(scene, modifiers.shadowless, position, target):
+    if _visible_ignoring(scene, modifiers.shadowless, origin, target):
         return factor
     return wp.vec3(0.0)
 
@@ -94,7 +98,7 @@ def _visible_ignoring(scene: SceneData, shadowless: int, position: wp.vec3, targ
     xyz = wp.vec3(target[0], target[1], target[2])
     for _ in range(CROSSINGS):
         direction = xyz - origin * target[3]
-        hit = closest(scene, origin, direction, wp.where(target[3] == 0.0, 3.0e38, 0.999999))
+        hit = closest(scene, origin, direction, wp.where(target[3] == 0.0, 3.0e38, SHADOW_RAY_END))
         if hit.triangle < 0:
             return True
         if not in_link_set(scene.light_tables[0].modifiers, shadowless, scene.triangle_mesh[hit.triangle]):

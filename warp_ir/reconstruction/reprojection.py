@@ -108,7 +108,7 @@ def reproject_to_reference(
         reference_scene = shutter.scenes[shutter.reference].address
         hit = _evaluate_surface_point(scene, surface_point, surface_point.triangle, normal)
         reference = _evaluate_surface_point(reference_scene, surface_point, row, normal)
-        # Only the motion is added, which keeps the smooth-terminator offset.
+        # Only the motion is added, which keeps the offset from the surface.
         out.position += reference.position - hit.position
         out.normal += reference.normal - hit.normal
     return out

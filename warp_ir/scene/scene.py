@@ -41,6 +41,11 @@ class Scene:
         return any(max(material.emission) > 0.0 or material.glow is not None for material in self.materials)
 
     @property
+    def has_normals(self) -> bool:
+        """Whether any mesh has normals of its own."""
+        return any(mesh.normals is not None for mesh in self.meshes)
+
+    @property
     def triangle_count(self) -> int:
         """Number of stored triangles: the sum over all meshes, prototypes counted once."""
         return sum(len(mesh.triangles) for mesh in self.meshes)

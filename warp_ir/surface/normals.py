@@ -1,4 +1,4 @@
-"""Shading normals: interpolated, normal-mapped, and the offset that avoids the shadow terminator of flat triangles."""
+"""Shading normals: interpolated, normal-mapped, and the height of the smooth surface that they imply."""
 
 import warp as wp
 
@@ -91,36 +91,56 @@ def _mapped_normal(address: wp.uint64, hit: Hit, normal: wp.vec3, footprint: flo
 
 
 @wp.func
-def terminator_offset(scene: SceneData, hit: Hit) -> wp.vec3:
-    """The offset from a hit to the smooth surface implied by its triangle's normals; zero where that is not above it.
+def smooth_height(scene: SceneData, hit: Hit, normal: wp.vec3) -> float:
+    """The height, along the interpolated `normal`, of the smooth surface that the corners' normals imply at a hit.
 
-    The point is projected onto the tangent planes at the corners, and the projections are interpolated (Hanika 2021,
-    Hacking the Shadow Terminator). Light that reaches the smooth surface at grazing angles passes below the triangle's
-    plane: at the triangle itself it would be occluded.
+    It is 0 where the normals do not bend outwards, and where geometry stands on the surface or close above it.
     """
     if scene.triangle_normals[hit.triangle] < 0:
-        return wp.vec3(0.0)
-    return _terminator_offset(scene.address, hit)
+        return 0.0
+    return _smooth_height(scene.address, hit, normal)
+
+
+@wp.func
+def _bend(a: wp.vec3, b: wp.vec3, normal_a: wp.vec3, normal_b: wp.vec3, side: float) -> float:
+    """How far each end of an edge lies below the tangent plane of the other, in sum; 0 if the normals bend inwards.
+
+    Normals that are all tilted alike bend nothing: what one end rises, the other falls.
+    """
+    return wp.max(wp.dot(normal_b - normal_a, b - a) * side, 0.0)
 
 
 @wp.func(inline=False)
-def _terminator_offset(address: wp.uint64, hit: Hit) -> wp.vec3:
-    """`terminator_offset` as a called function."""
+def _smooth_height(address: wp.uint64, hit: Hit, normal: wp.vec3) -> float:
+    """`smooth_height` as a called function.
+
+    The heights of the tangent planes at the corners, Σ wᵢ nᵢ·(pᵢ - p) (Hanika 2021), equal the sum over the edges of
+    wᵢ wⱼ (nⱼ - nᵢ)·(pⱼ - pᵢ), of which only the outward bends are taken.
+    """
     scene = scene_at(address)[0]
     row = scene.triangle_normals[hit.triangle]
-    offset = wp.vec3(0.0)
-    for k in range(3):
-        weight = wp.where(k == 0, hit.u, wp.where(k == 1, hit.v, 1.0 - hit.u - hit.v))
-        n = scene.corner_normals[row + k]
-        corner = scene.points[scene.indices[3 * hit.triangle + k]]
-        if hit.instance >= 0:
-            n = wp.normalize(wp.transpose(scene.instances[hit.instance].inverse) * n)
-            corner = scene.instance_axes[hit.instance] * corner + scene.instances[hit.instance].centre
-        n = wp.where(wp.dot(n, hit.normal) < 0.0, -n, n)
-        height = wp.dot(corner - hit.position, n)
-        offset += weight * wp.max(height, 0.0) * n
-    # No offset past geometry that stands on the surface or close above it.
-    if wp.length_sq(offset) > 0.0:
-        if intersect_scene(address, hit.position, offset, 2.0, True).triangle >= 0:
-            return wp.vec3(0.0)
-    return offset
+    na = scene.corner_normals[row]
+    nb = scene.corner_normals[row + 1]
+    nc = scene.corner_normals[row + 2]
+    a = scene.points[scene.indices[3 * hit.triangle]]
+    b = scene.points[scene.indices[3 * hit.triangle + 1]]
+    c = scene.points[scene.indices[3 * hit.triangle + 2]]
+    if hit.instance >= 0:
+        to_device = wp.transpose(scene.instances[hit.instance].inverse)
+        na = wp.normalize(to_device * na)
+        nb = wp.normalize(to_device * nb)
+        nc = wp.normalize(to_device * nc)
+        axes = scene.instance_axes[hit.instance]
+        a = axes * a
+        b = axes * b
+        c = axes * c
+    w = 1.0 - hit.u - hit.v
+    side = wp.where(wp.dot(hit.u * na + hit.v * nb + w * nc, normal) < 0.0, -1.0, 1.0)
+    height = hit.u * hit.v * _bend(a, b, na, nb, side)
+    height += hit.v * w * _bend(b, c, nb, nc, side)
+    height += w * hit.u * _bend(c, a, nc, na, side)
+    # Not past geometry that stands on the surface or close above it.
+    if height > 0.0:
+        if intersect_scene(address, hit.position, normal * height, 2.0, True).triangle >= 0:
+            return 0.0
+    return height

@@ -12,6 +12,8 @@ from warp_ir.surface.offset import spawn_ray_origin
 wp.set_module_options({"enable_backward": False})
 
 _INFINITY = wp.constant(3.0e38)
+SHADOW_RAY_END = wp.constant(0.999999)
+"""Where a shadow ray ends, on its way from 0 to the target at 1."""
 _MAX_LAYERS = wp.constant(1024)  # transparent surfaces that a ray may pass
 
 
@@ -122,7 +124,7 @@ def _closest(address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: flo
 @wp.func
 def visible(scene: SceneData, origin: wp.vec3, target: wp.vec4) -> bool:
     """Whether a homogeneous point (w = 0: a direction) is unoccluded from a point; both are off their surfaces."""
-    t_max = wp.where(target[3] == 0.0, _INFINITY, 0.999999)
+    t_max = wp.where(target[3] == 0.0, _INFINITY, SHADOW_RAY_END)
     if scene.non_opaque_count > 0:
         return _closest_opaque(scene.address, origin, target, t_max).triangle < 0
     return intersect_scene(scene.address, origin, _to_target(origin, target), t_max, True).triangle < 0

@@ -18,7 +18,7 @@ from warp_ir.bvh import on_cuda
 from warp_ir.device_scene import SceneData
 from warp_ir.light_modifiers import approximate_shaping
 from warp_ir.lights import light_visibility
-from warp_ir.surface import scene_at
+from warp_ir.surface import ShadingPoint, scene_at
 from warp_ir.vpl.sets import (
     BLOCK_ROWS,
     LANES,
@@ -35,17 +35,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _LANES = wp.constant(LANES)
 _MAX_RAYS = wp.constant(8)
-
-
-@wp.struct
-class ShadingPoint:
-    """A surface point that receives light, with its geometric normal and its shading normal."""
-
-    position: wp.vec3
-    normal: wp.vec3  # geometric
-    shading_normal: wp.vec3
-    mesh: int
-    from_camera: bool  # whether the camera sees the point
 
 
 @wp.func
@@ -178,7 +167,7 @@ def _shadowed_contribution(
         vpl = group.order[slot]
         if vpl < group.vpls.on_lights:
             modifiers = group.vpls.modifiers[vpl]
-    visibility = light_visibility(scene, modifiers, x.position, x.mesh, x.from_camera, position)
+    visibility = light_visibility(scene, modifiers, x, position)
     if modifiers >= 0:  # the approximate factor is part of f already
         visibility = visibility / approximate_shaping(
             scene.light_tables[0].modifiers.rows[modifiers], x.position, position
