@@ -24,7 +24,7 @@ def upload_emitters(
     frame: DeviceFrame,
     data: SceneData,
     launcher: Launcher,
-) -> None:
+) -> float:
     """Fills the emitter tables of a `SceneData`; an emitter's selection probability is proportional to its power.
 
     Any positive probabilities are unbiased, so power is only estimated, from mean radiance times area. Emitters of
@@ -37,6 +37,9 @@ def upload_emitters(
         frame: The device's frame.
         data: The `SceneData`; its geometry tables must have been filled.
         launcher: Launcher of the device.
+
+    Returns:
+        The power of all emitters.
     """
     kinds: list[npt.NDArray[np.int32]] = []
     items: list[npt.NDArray[np.int32]] = []
@@ -87,6 +90,7 @@ def upload_emitters(
     triangle_emitter = np.full(data.triangle_count if emission.any() else 1, -1, np.int32)
     triangle_emitter[item[~analytic]] = emitter[~analytic]
     data.triangle_emitter = launcher.array(triangle_emitter, wp.int32)
+    return float(power.sum())
 
 
 def _mean_emission(scene: Scene, mesh: Mesh, triangles: Ints, areas: Floats, footprint: float) -> Floats:

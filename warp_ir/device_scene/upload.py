@@ -40,6 +40,8 @@ class DeviceScene:
     """Largest albedo of any surface and channel."""
     emits: bool
     """Whether anything in the scene emits."""
+    power: float
+    """Power of all emitters, the mean over channels, with lengths in device units."""
     owners: tuple[object, ...]
     """The owners of geometry and lights: records hold only ids, and a freed id crashes."""
     source: Scene
@@ -130,7 +132,7 @@ def _upload(
         data.footprint = math.sqrt(area / _TEXTURE_PATCHES)
         geometry_owners = geometry.fill(k, data)
         first_triangles = geometry.first_triangles(k)
-        upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
+        power = upload_emitters(stored[k][0], first_triangles, uploaded, frame, data, launcher)
         data.sobol = launcher.array(sobol.sobol_matrices(), wp.uint32)
         on_device = launcher.empty(1, SceneData)
         data.address = wp.uint64(on_device.ptr)  # set in the copy as well: functions that read it pass it on
@@ -144,6 +146,7 @@ def _upload(
                 mean_albedo=scene.mean_albedo(),
                 max_albedo=_max_albedo(scene),
                 emits=data.emitter_count > 0,
+                power=power,
                 owners=(geometry_owners, uploaded.owners, on_device),
                 source=scene,
                 geometry=geometry,
