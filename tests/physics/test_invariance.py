@@ -46,17 +46,44 @@ def transformed(scene, linear, shift):
     )
 
 
-def test_twice_the_light_is_twice_the_film(estimator, device):
-    """Doubling every emission doubles every pixel, bit for bit."""
-    scene = box_with_lights()
-    brighter = dataclasses.replace(
+def with_light(scene, factor):
+    """The scene with every emission times a factor."""
+    return dataclasses.replace(
         scene,
-        materials=tuple(dataclasses.replace(m, emission=tuple(2 * e for e in m.emission)) for m in scene.materials),
-        lights=tuple(dataclasses.replace(x, radiance=tuple(2 * e for e in x.radiance)) for x in scene.lights),
+        materials=tuple(
+            dataclasses.replace(m, emission=tuple(factor * e for e in m.emission)) for m in scene.materials
+        ),
+        lights=tuple(dataclasses.replace(x, radiance=tuple(factor * e for e in x.radiance)) for x in scene.lights),
     )
-    np.testing.assert_array_equal(
-        render(brighter, estimator, device).radiance(), 2.0 * render(scene, estimator, device).radiance()
-    )
+
+
+@pytest.mark.parametrize("exponent", [1, -90, 80])
+def test_powers_of_two_of_light_scale_the_film(estimator, exponent, device):
+    """Twice the emission is twice every pixel, bit for bit, and so is 2⁸⁰ or 2⁻⁹⁰; the relative error stays.
+
+    The squares of such radiance are beyond float32. What is below its smallest normal number may lose bits.
+    """
+    scene, factor = box_with_lights(), 2.0**exponent
+    film, scaled = (render(x, estimator, device) for x in (scene, with_light(scene, factor)))
+    tiny = float(np.finfo(np.float32).tiny)
+    expected = film.radiance().astype(np.float64) * factor
+    np.testing.assert_allclose(scaled.radiance().astype(np.float64), expected, rtol=0.0, atol=tiny)
+    assert scaled.error() == pytest.approx(film.error(), rel=1e-6)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("exponent", [-90, 80])
+def test_powers_of_two_of_light_scale_a_blurred_film(estimator, exponent, device):
+    """The same through a lens, where pixels are supersampled; the exposure may take the factor back."""
+    scene, factor = box_with_lights(), 2.0**exponent
+    lens = dataclasses.replace(scene.camera, lens_radius=0.05, focus_distance=2.0)
+    scene = dataclasses.replace(scene, camera=lens)
+    brighter = with_light(scene, factor)
+    exposed = dataclasses.replace(brighter, camera=dataclasses.replace(lens, exposure=1.0 / factor))
+    film, scaled, back = (render(x, estimator, device).radiance() for x in (scene, brighter, exposed))
+    tiny = float(np.finfo(np.float32).tiny)
+    np.testing.assert_allclose(scaled.astype(np.float64), film.astype(np.float64) * factor, rtol=0.0, atol=tiny)
+    np.testing.assert_allclose(back, film, rtol=0.0, atol=tiny)
 
 
 def test_exposure_scales_the_film(estimator, device):

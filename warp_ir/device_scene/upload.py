@@ -66,6 +66,11 @@ class DeviceScene:
     """Lower and upper corner of all shutter samples together, in world space."""
 
     @property
+    def power(self) -> float:
+        """Power of all emitters, the mean over channels, with lengths in device units."""
+        return float(self.emitter_power.sum())
+
+    @property
     def is_valid(self) -> bool:
         """Whether its geometry is still on the device: no later upload has replaced it."""
         return self.geometry_version == self.geometry.version

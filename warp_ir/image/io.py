@@ -316,14 +316,14 @@ def _write_exr(
         np.clip(plane, -_HALF_MAX, _HALF_MAX) if stored == oiio.HALF else plane
         for (plane, _), stored in zip(channels.values(), formats, strict=True)
     ]
-    beyond = [
+    overflows = [
         np.abs(plane) > _HALF_MAX
         for (plane, _), stored in zip(channels.values(), formats, strict=True)
         if stored == oiio.HALF
     ]
-    clipped = int(np.any(beyond, axis=0).sum()) if beyond else 0
+    clipped = int(np.any(overflows, axis=0).sum()) if overflows else 0
     if clipped:
-        what = f"{clipped} of {beyond[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
+        what = f"{clipped} of {overflows[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
         warnings.warn(f"{path}: {what}; 32 bits hold them (half=False, --float)", stacklevel=3)
     pixels = np.stack(planes, axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])

@@ -128,7 +128,7 @@ def _supersample_blur(
     ray_counts: wp.vec2i,
     mixed: bool,
 ) -> _BlurredPixel:
-    """Radiance of a pixel over lens and shutter, with exposure.
+    """Radiance of a pixel over lens and shutter times `samples.scale`, with exposure.
 
     `ray_counts` are the rays of the film, which come first in the sequence, and the maximum. A few are enough if they
     agree and the pixel is not known to be `mixed`.
@@ -148,14 +148,15 @@ def _supersample_blur(
         u = jitter(scene, camera, p, pixel.rays, samples.seed)
         lens = lens_point(scene, camera, p, pixel.rays, samples.seed)
         point = trace_camera_ray(scene, camera, camera_ray(camera, p, u, lens))
+        emission = point.emission * samples.scale
         if pixel.rays == 0:
             first_albedo = point.albedo
-            first_emission = point.emission
-        contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_emission)
+            first_emission = emission
+        contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(emission - first_emission)
         is_own = point.mesh < 0 and samples.surfaces.footprint[p] <= 0.0
         exposure = shutter.exposures[shutter_sample]
         pixel.rays += 1
-        pixel.emission += point.emission * exposure
+        pixel.emission += emission * exposure
         pixel.albedo += point.albedo
         pixel.normal += point.shading_normal
         if point.mesh >= 0:
@@ -206,7 +207,7 @@ def _compose_blurred(
 ) -> None:
     """Radiance of a pixel: filtered if it is sharp and shows one surface, otherwise supersampled."""
     p = first + wp.tid()
-    x = unfiltered_estimate(film, p)
+    x = unfiltered_estimate(film, p, out.scale)
     out.edge_residual.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     unassigned = _unassigned_irradiance(samples, p, x, exposure)
     edge = on_edge(samples.surfaces, film, p)

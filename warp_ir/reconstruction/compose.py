@@ -23,11 +23,12 @@ _MAX_STANDARD_ERRORS = wp.constant(8.0)  # by which the filtered value may diffe
 
 @wp.struct
 class ResolvedPicture:
-    """The picture, one column per pixel, and what its correction on edges needs."""
+    """The picture times `scale`, one column per pixel, and what its correction on edges needs."""
 
     rows: wp.array2d[wp.vec3]  # direct with emission, indirect; if there are five: albedo, normal, unfiltered mean
     edge_residual: IrradianceLayer  # unfiltered mean minus picture, w: its expected square by noise; -1: no edge
     max_rays: int  # of a supersampled pixel
+    scale: float  # factor from the film's radiance to this picture's
 
 
 @wp.struct
@@ -57,12 +58,12 @@ def shrink_to_mean(difference: wp.vec3, variance: float, n: float) -> wp.vec3:
 
 
 @wp.func
-def unfiltered_estimate(film: FilmData, p: int) -> ResolvedPixel:
-    """A pixel of the film's own means."""
+def unfiltered_estimate(film: FilmData, p: int, scale: float) -> ResolvedPixel:
+    """A pixel of the film's own means times `scale`."""
     x = ResolvedPixel()
-    x.emission = emission_of(film, p)
-    x.direct = film.direct[p]
-    x.indirect = film.indirect[p]
+    x.emission = emission_of(film, p) * scale
+    x.direct = film.direct[p] * scale
+    x.indirect = film.indirect[p] * scale
     x.albedo = film.albedo[p] / float(film.count[p])
     x.normal = film.normal[p] / float(film.count[p])
     x.unfiltered = x.emission + x.direct + x.indirect
@@ -152,7 +153,7 @@ def _compose(
     """Radiance of a pixel from filtered irradiance; on edges, from supersampling."""
     p = first + wp.tid()
     surfaces = samples.surfaces
-    unfiltered = unfiltered_estimate(film, p)
+    unfiltered = unfiltered_estimate(film, p, out.scale)
     x = unfiltered
     out.edge_residual.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     if samples.count[p] != film.count[p] or on_edge(surfaces, film, p):
@@ -171,13 +172,13 @@ def edge_rays(iterations: int) -> int:
 
 
 def new_resolved_picture(
-    pixels: int, edge_residual: IrradianceLayer, max_rays: int, features: bool, launcher: Launcher
+    pixels: int, edge_residual: IrradianceLayer, max_rays: int, scale: float, features: bool, launcher: Launcher
 ) -> ResolvedPicture:
     """An uninitialised `ResolvedPicture`, with or without features; `edge_residual` is overwritten."""
     out = ResolvedPicture()
     out.edge_residual = edge_residual
     out.rows = launcher.empty((5 if features else 2, pixels), wp.vec3)
-    out.max_rays = max_rays
+    out.max_rays, out.scale = max_rays, scale
     return out
 
 
@@ -196,5 +197,9 @@ def compose(
 
 
 def rows_to_host(out: ResolvedPicture) -> npt.NDArray[np.float32]:
-    """The rows of a `ResolvedPicture` on the host, float32 [2 or 5, pixels, 3]."""
-    return np.asarray(out.rows.numpy())
+    """The rows of a `ResolvedPicture` on the host, without its scale, float32 [2 or 5, pixels, 3]."""
+    rows: npt.NDArray[np.float32] = out.rows.numpy()
+    if out.scale != 1.0:
+        for radiance in (rows[0], rows[1], *rows[4:]):
+            radiance *= np.float32(1.0 / out.scale)
+    return rows

@@ -127,7 +127,7 @@ def supersample_edge(
     unassigned: WeightedIrradiance,
     ray_counts: wp.vec2i,
 ) -> SupersampledPixel:
-    """Radiance of a pixel on an edge, without exposure.
+    """Radiance of a pixel on an edge times `samples.scale`, without exposure.
 
     `ray_counts` are the rays of the film, which come first in the sequence, and the maximum. `unassigned` is the
     irradiance of surfaces that no pixel centre shows.
@@ -142,15 +142,16 @@ def supersample_edge(
     while out.rays < ray_counts[1] and (mixed or out.rays < _MIN_RAYS):
         u = jitter(scene, camera, p, out.rays, samples.seed)
         point = trace_camera_ray(scene, camera, camera_ray(camera, p, u, wp.vec2(0.0, 0.0)))
+        emission = point.emission * samples.scale
         if out.rays == 0:
             first_albedo = point.albedo
-            first_emission = point.emission
+            first_emission = emission
         # A pixel that shows one surface needs no more rays: the edge crosses its neighbour.
-        contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(point.emission - first_emission)
+        contrast = wp.length_sq(point.albedo - first_albedo) + wp.length_sq(emission - first_emission)
         mixed = mixed or contrast > 0.0 or point.mesh < 0
         mixed = mixed or match_weight(surfaces, p, point.position, point.smooth_normal) < MIN_MATCH
         out.rays += 1
-        out.emission += point.emission
+        out.emission += emission
         out.albedo += point.albedo
         out.normal += point.shading_normal
         if point.mesh >= 0 and wp.max(point.albedo) > 0.0:

@@ -1,5 +1,6 @@
 """Reconstruction on one page: samples are accumulated in every iteration, pictures are made of them on request."""
 
+import math
 import weakref
 from collections.abc import Sequence
 from typing import Any, Self
@@ -32,6 +33,11 @@ SCRATCH = float_count(*_LAYER_TYPES)
 """Scratch memory for making a picture [float32 per pixel]."""
 
 
+def _power_of_two(value: float) -> float:
+    """The power of two just above a number, within the range of float32; 1 for 0."""
+    return 2.0 ** min(max(math.frexp(value)[1], -120), 120) if value > 0.0 else 1.0
+
+
 class Reconstruction:
     """Accumulates samples of irradiance on the pixels' surfaces, and makes the picture from them and the film."""
 
@@ -54,12 +60,19 @@ class Reconstruction:
         """
         reference = shutter[len(shutter) // 2]
         self._scene, self._camera = reference.scene, reference.camera
-        self._exposure = sum(sample.exposure for sample in shutter) / len(shutter)
+        exposure = sum(sample.exposure for sample in shutter) / len(shutter)
+        exposure_unit = _power_of_two(exposure)
+        self._exposure = exposure / exposure_unit
+        # Scaling by powers of two changes no bit of the picture.
+        scale = 1.0 / _power_of_two(max(sample.scene.power / (sample.scene.area or 1.0) for sample in shutter))
+        self._film_scale = scale / exposure_unit
         self._launcher, self._block = launcher, weakref.ref(block)
         self._scratch = Scratch(launcher)
         with launcher.phase("filter"):
-            self._samples, self._edge_share = new_sample_buffer(self._scene, self._camera, launcher, gbuffer, seed)
-            self._shutter = new_shutter_data(shutter, launcher) if self._camera.blurs else None
+            self._samples, self._edge_share = new_sample_buffer(
+                self._scene, self._camera, launcher, gbuffer, seed, scale
+            )
+            self._shutter = new_shutter_data(shutter, exposure_unit, launcher) if self._camera.blurs else None
 
     def accumulate(self, gbuffer: GBuffer, shutter_sample: int = 0) -> None:
         """Adds one iteration's samples of irradiance over π, made at one of the shutter samples."""
@@ -106,7 +119,8 @@ class Reconstruction:
             samples = estimate_means(self._samples, variance, layer, launcher)
             layer, other_layer = filter_layer(samples.surfaces, layer, other_layer, launcher)
             rays = edge_rays(iterations) if self._shutter is None else blur_rays(iterations)
-            out = new_resolved_picture(samples.count.shape[0], other_layer, rays, features, launcher)
+            pixels = samples.count.shape[0]
+            out = new_resolved_picture(pixels, other_layer, rays, self._film_scale, features, launcher)
             if self._shutter is not None:
                 estimate_missing_variance(samples, launcher)
                 compose_blurred(self._shutter, samples, layer, film, self._exposure, out, launcher)

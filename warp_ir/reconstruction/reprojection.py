@@ -45,7 +45,7 @@ class ShutterData:
 
     scenes: wp.array[SceneData]
     cameras: wp.array[CameraData]
-    exposures: wp.array[wp.float32]
+    exposures: wp.array[wp.float32]  # in units of the reconstruction
     row_offsets: wp.array[wp.int32]  # row of a moving triangle at a shutter sample minus its row at the reference time
     log2_count: int
     reference: int  # number of the middle shutter sample
@@ -201,14 +201,14 @@ def surfaces_move(scenes: Sequence[DeviceScene]) -> bool:
     return any(s.first_triangles != first.first_triangles for s in scenes) or any(p != places[0] for p in places)
 
 
-def new_shutter_data(shutter: Sequence[ShutterSample], launcher: Launcher) -> ShutterData:
-    """The `ShutterData` of some shutter samples, whose number is a power of two."""
+def new_shutter_data(shutter: Sequence[ShutterSample], exposure_unit: float, launcher: Launcher) -> ShutterData:
+    """The `ShutterData` of some shutter samples, whose number is a power of two; exposures are in a given unit."""
     data = ShutterData()
     data.log2_count, data.reference = len(shutter).bit_length() - 1, len(shutter) // 2
     scenes = [sample.scene for sample in shutter]
     data.scenes = launcher.array([scene.data for scene in scenes], SceneData)
     data.cameras = launcher.array([sample.camera for sample in shutter], CameraData)
-    data.exposures = launcher.array([sample.exposure for sample in shutter], wp.float32)
+    data.exposures = launcher.array([sample.exposure / exposure_unit for sample in shutter], wp.float32)
     reference = scenes[data.reference]
     offsets = [_row_offset(scene, reference) for scene in scenes]
     data.sobol = reference.data.sobol

@@ -42,9 +42,10 @@ class SampleBuffer:
     unassigned_indirect: wp.array[wp.vec3]
     unassigned_count: wp.array[wp.int32]
     seed: wp.uint32  # of the film
+    scale: float  # factor from radiance to all of the above, so that squares neither overflow nor underflow
 
 
-_NO_SUMS = ("surfaces", "variance", "seed")
+_NO_SUMS = ("surfaces", "variance", "seed", "scale")
 """Fields of `SampleBuffer` that are no sums over samples."""
 
 
@@ -73,11 +74,11 @@ def _find_edges(first: int, surfaces: PixelSurfaces) -> None:
 @wp.func
 def add_sample(samples: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
     """Adds a sample on the surface of pixel `p`, if it is finite."""
-    d = mean_channel(direct)
-    i = mean_channel(indirect)
+    d = mean_channel(direct) * samples.scale
+    i = mean_channel(indirect) * samples.scale
     if wp.isfinite(d) and wp.isfinite(i):
-        samples.direct[p] += direct
-        samples.indirect[p] += indirect
+        samples.direct[p] += direct * samples.scale
+        samples.indirect[p] += indirect * samples.scale
         samples.squares[p] += wp.vec2(d * d, i * i)
         samples.count[p] += 1
 
@@ -86,8 +87,8 @@ def add_sample(samples: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3
 def add_unassigned(samples: SampleBuffer, p: int, direct: wp.vec3, indirect: wp.vec3) -> None:
     """Adds an unassigned sample that was traced through pixel `p`, if it is finite."""
     if wp.isfinite(mean_channel(direct)) and wp.isfinite(mean_channel(indirect)):
-        samples.unassigned_direct[p] += direct
-        samples.unassigned_indirect[p] += indirect
+        samples.unassigned_direct[p] += direct * samples.scale
+        samples.unassigned_indirect[p] += indirect * samples.scale
         samples.unassigned_count[p] += 1
 
 
@@ -176,11 +177,11 @@ def _squared_deviations(samples: SampleBuffer, q: int) -> wp.vec2:
 
 
 def new_sample_buffer(
-    scene: DeviceScene, camera: CameraData, launcher: Launcher, gbuffer: GBuffer, seed: int
+    scene: DeviceScene, camera: CameraData, launcher: Launcher, gbuffer: GBuffer, seed: int, scale: float
 ) -> tuple[SampleBuffer, float]:
     """An empty `SampleBuffer`, and the fraction of pixels next to another surface.
 
-    `gbuffer` is overwritten, `seed` is that of the film.
+    `gbuffer` is overwritten, `seed` is that of the film, `scale` the factor from radiance to the sums.
     """
     pixels = camera.columns * camera.rows
     surfaces = PixelSurfaces()
@@ -198,6 +199,7 @@ def new_sample_buffer(
     samples.squares = launcher.zeros(pixels, wp.vec2)
     samples.count, samples.unassigned_count = launcher.zeros(pixels, wp.int32), launcher.zeros(pixels, wp.int32)
     samples.seed = wp.uint32(seed)
+    samples.scale = scale
     return samples, float(surfaces.edge.numpy().mean())
 
 
