@@ -166,7 +166,7 @@ def test_both_traversals_find_the_same(launcher, count):
 def test_no_ray_in_many_escapes(launcher, shape, traverse):
     """Of 200 000 rays inside closed meshes, three in four aimed at edges and vertices, not one slips through.
 
-    Warp's own query, whose boxes are not conservative, loses one in 200 to 500.
+    Warp's own query loses one in some thousand on such a sphere.
     """
     points, triangles = cube() if shape == "cube" else sphere(level=5)
     random = np.random.default_rng(3)

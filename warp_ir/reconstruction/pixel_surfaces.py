@@ -47,6 +47,7 @@ def pixel_match_weights(surfaces: PixelSurfaces, p: int, q: int) -> wp.vec2:
 
 @wp.func
 def _match_weights(surfaces: PixelSurfaces, p: int, footprint: float, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
+    """As `match_weights`, with a footprint of its own; without weight where that is 0."""
     if footprint <= 0.0:
         return wp.vec2(0.0)
     pixel_normal = surfaces.normal[p]
