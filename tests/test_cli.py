@@ -189,7 +189,7 @@ class Interrupted:
     """A film on which nothing was exposed."""
 
     width = height = 4
-    iterations, seconds, interrupted, rejected = 0, 0.0, True, 0
+    iterations, seconds, interrupted, rejected = 0, 0.0, signal.SIGINT, 0
 
     def __init__(self):
         self.timings, self.counts = {}, {}
@@ -203,6 +203,7 @@ class Stopped:
 
     def __init__(self, scene, settings, **_):
         self.wanted = self.settings = settings
+        self.warnings = ()
 
     def new_film(self):
         return Interrupted()

@@ -162,7 +162,7 @@ def SphereLight "L" { float inputs:radius = 0.1
     ("flags", "word"),
     [
         (["--eye", "-3", "0", "0"], "eye: no light reaches what the camera sees"),
-        (["--eye", "-1", "0.1", "0.2", "--look-at", "0", "0", "0"], "eye: the camera lies in a surface"),
+        (["--eye", "-1", "0.1", "0.2", "--look-at", "0", "0", "0"], "eye: it lies in the surface of /Room"),
         (["--eye", "0.5", "0.2", "0.1", "--mask", "/Room", "--default-light", "none"], "eye: no light reaches"),
         (["--eye", "0.5", "0.2", "0.1"], ""),
         (["--eye", "-3", "0", "0", "--mask", "/Room"], ""),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from warp_ir.usd import StageReader
     from warp_ir.usd.settings.render_spec import Product
 
-_EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black", "covers the picture")
+_EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
 """Words of the warnings of a scene that explain a black picture."""
 _IN_SURFACE = 1e-6
 """Depth in units of the scene's size below which a camera lies in the surface that it sees."""

@@ -14,6 +14,7 @@ from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _SPACING = wp.constant(16)  # of the knots between which the gain is interpolated [pixels]
+_MAX_GAIN = wp.constant(16.0)  # where the filter has lost more than that, its picture says nothing of the level
 _RADIUS = wp.constant(2)  # of the window over which the noise of differences on edges is estimated [pixels]
 
 
@@ -66,13 +67,13 @@ def _correct_edges(first: int, surfaces: PixelSurfaces, out: ResolvedPicture, re
 
 @wp.func
 def _filtered_radiance(film: FilmData, out: ResolvedPicture, residual: IrradianceLayer, p: int) -> _ReflectedRadiance:
-    """Radiance in the picture if it had the film's camera rays alone; supersampled pixels have more."""
+    """Radiance in the picture, in its unit, if it had the film's camera rays alone; supersampled pixels have more."""
     x = _ReflectedRadiance()
     if residual.direct[p][3] >= 0.0:
-        x.direct = film.direct[p] - rgb(residual.direct[p])
-        x.indirect = film.indirect[p] - rgb(residual.indirect[p])
+        x.direct = film.direct[p] * out.scale - rgb(residual.direct[p])
+        x.indirect = film.indirect[p] * out.scale - rgb(residual.indirect[p])
     else:
-        x.direct = out.rows[0, p] - emission_of(film, p)
+        x.direct = out.rows[0, p] - emission_of(film, p) * out.scale
         x.indirect = out.rows[1, p]
     return x
 
@@ -88,7 +89,8 @@ def _estimate_gains(
 ) -> None:
     """Unfiltered over filtered radiance around a knot, weighted by its hat function, for direct and indirect light.
 
-    Hat functions sum to 1. So the picture times the interpolated gain has the sum of the unfiltered mean, exactly.
+    Hat functions sum to 1. So the picture times the interpolated gain has exactly the sum of the unfiltered mean, as
+    long as no gain is limited.
     """
     knot = first + wp.tid()
     column = (knot % gains.shape[1]) * _SPACING
@@ -100,12 +102,12 @@ def _estimate_gains(
             p = y * surfaces.columns + x
             w = float(_SPACING - wp.abs(x - column)) * float(_SPACING - wp.abs(y - row))
             radiance = _filtered_radiance(film, out, residual, p)
-            unfiltered += w * mean_channels(film.direct[p], film.indirect[p])
+            unfiltered += (w * out.scale) * mean_channels(film.direct[p], film.indirect[p])
             filtered += w * mean_channels(radiance.direct, radiance.indirect)
     gain = wp.vec2(1.0)
     for k in range(2):
         if filtered[k] > 0.0:
-            gain[k] = unfiltered[k] / filtered[k]
+            gain[k] = wp.min(unfiltered[k] / filtered[k], _MAX_GAIN)
     gains[knot // gains.shape[1], knot % gains.shape[1]] = gain
 
 

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 LEVELS = 4
 """Levels of the wavelet transform; taps are 1, 2, 4, ... pixels apart. At a fifth hardly any taps would be similar."""
-_SIGMAS = (5.5, 7.5)
+_SIGMAS = (5.5, 12.0)
 """Standard errors by which similar values may differ at the first level, for direct and indirect irradiance. It is
 smaller for direct light, because its shadows are sharp."""
 _SIGMA_DECAY = 0.45

@@ -34,7 +34,7 @@ def diagnose_black_picture(scene: Scene, report: Report) -> None:
         report.warn(camera.name, f"clippingRange: far, {far:g}, lies before all geometry, which begins at {nearest:g}")
     surface = _surface_around_eye(scene)
     if surface is not None:
-        what = f"it lies in the surface of {surface.name}, which covers the picture; clip it away by clippingRange"
+        what = f"it lies in the surface of {surface.name}: the picture is black; clippingRange can clip it away"
         report.warn(camera.name, what)
     for mesh in _emitters_facing_away(scene):
         why = "the camera is inside it, and it emits outwards only (doubleSided, orientation)"
