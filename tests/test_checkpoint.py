@@ -14,6 +14,8 @@ import warp_ir as ir
 from warp_ir.cli import main
 from warp_ir.image.io import read_image
 
+pytestmark = pytest.mark.extended
+
 SCENES = Path(__file__).parent.parent / "scenes_usd"
 ROOM = str(SCENES / "cornell_box.usda")
 SMALL = ["--width", "16", "--light-paths", "32", "--device", "cpu"]
@@ -65,7 +67,6 @@ def command(picture, *more):
     return ["render", ROOM, str(picture), *SMALL, *more]
 
 
-@pytest.mark.extended
 def test_kill_loses_no_more_than_an_interval(tmp_path):
     """Kill -9, then --resume: the picture of a command that was left in peace, bit for bit, and no trace beside it."""
     picture, other = tmp_path / "a.npy", tmp_path / "b.npy"

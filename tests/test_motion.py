@@ -16,6 +16,8 @@ from warp_ir.procedural import cornell_box
 from warp_ir.usd.geometry.prototypes import MAX_FLATTENED_TRIANGLES
 from warp_ir.usd.load import StageReader
 
+pytestmark = pytest.mark.extended
+
 SCENES = Path(__file__).parent.parent / "scenes_usd"
 TURNTABLE = SCENES / "turntable.usda"
 
@@ -268,7 +270,6 @@ def coverage(n, shift, half):
     return (np.abs(x - shift * times) < half).mean(axis=1).reshape(n, 16).mean(axis=1)
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("what", ["transform", "points", "camera"])
 def test_coverage_of_a_moving_quad(tmp_path, what, device):
     """A quad that moves while the shutter is open covers a pixel for a share of the time: a trapezium.
@@ -304,7 +305,6 @@ def test_coverage_of_a_moving_quad(tmp_path, what, device):
     np.testing.assert_allclose(sharp, coverage(n, 0.0, half), atol=4 * noise)
 
 
-@pytest.mark.extended
 def test_a_varying_light_gives_its_mean(tmp_path):
     """A lamp whose intensity rises from 0 to 2 while the shutter is open illuminates like one of intensity 1."""
     lamp = """def SphereLight "L" {
@@ -423,7 +423,6 @@ def test_moving_instances_take_the_memory_of_one_prototype(tmp_path):
     assert {each.data.instance_count for each in uploaded} == {count}
 
 
-@pytest.mark.extended
 def test_stored_instances_blur_as_if_written_out(tmp_path, monkeypatch):
     """The same paths, up to rounding: the pictures agree but for pixels where a ray passes an edge."""
     lamp = 'def SphereLight "L" { float inputs:intensity = 30\n double3 xformOp:translate = (0, 2, 3)\n'
@@ -455,7 +454,6 @@ def test_moving_triangles_limit_the_shutter_samples(tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.extended
 def test_blur_is_not_filtered_away():
     """With and without the filter a blurred picture has the same mean."""
     scene = ir.load_usd(TURNTABLE, time=5.0)

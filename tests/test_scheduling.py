@@ -10,6 +10,8 @@ from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
 from warp_ir.scheduling import AdaptiveScheduler, select_tiles
 
+pytestmark = pytest.mark.extended
+
 SETTINGS = ir.RenderSettings(width=36, height=20, light_paths=64)  # 5 x 3 tiles, some of which reach beyond
 
 
@@ -109,7 +111,6 @@ def test_films_of_some_tiles_merge():
     np.testing.assert_array_equal(pixels_of(films[0].tile_iterations, films[0])[..., None], n[0] + n[1])
 
 
-@pytest.mark.extended
 def test_a_target_leaves_out_good_tiles(tmp_path):
     """A render to an error skips samples, reaches it, has the same bits on any number of threads, and when resumed."""
     scene, target = cornell_box(), 0.08

@@ -15,6 +15,8 @@ from warp_ir.procedural import floor
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind, Projection
 
+pytestmark = pytest.mark.extended
+
 GREY = (ir.Material(albedo=(0.5, 0.5, 0.5)),)
 
 
@@ -63,7 +65,6 @@ SKY = ir.Light("sky", LightKind.DOME, (1.0, 1.0, 1.0))
 SUN = ir.Light("sun", LightKind.DISTANT, (1.0, 1.0, 1.0), angle=10.0, world_from_light=placed(rotation_x(30.0)))
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("distance", [1.0e6, 2.56e7, 1.0e9])
 @pytest.mark.parametrize("sky", [SKY, SUN], ids=["sky", "sun"])
 @pytest.mark.parametrize("camera", [None, (5.0, 4.0, 3.0)], ids=["orthographic", "perspective"])
@@ -139,7 +140,6 @@ def rooms(power):
     return ir.Scene(meshes, GREY, lamps, ir.Camera.look_at((0, -0.9, 0), (0, 1, -0.3), up=(0, 0, 1)))
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_a_lamp_in_a_sealed_room_takes_nothing_away(estimator):
     """The picture of the dim lamp is that without the other, whatever the other's power; and its error is known."""
@@ -153,7 +153,6 @@ def test_a_lamp_in_a_sealed_room_takes_nothing_away(estimator):
     assert guiding_applies(scene, 10.0) and not guiding_applies(upload_scene(rooms(1.0), Launcher("cpu")), 10.0)
 
 
-@pytest.mark.extended
 def test_a_lamp_indoors_is_not_drowned_by_the_sun():
     """A sun over 1 km of ground, of 10⁴ times the lamp's power, and a lamp in a closed room: that of the lamp alone."""
     lamp = light_at((0, 0, 0.5), "lamp", LightKind.SPHERE, (30.0,) * 3, radius=0.1)
@@ -211,7 +210,6 @@ LARGE = {
 """Lights, and E/(π L) below them: the view factors of a square, a disk and a sphere."""
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("name", LARGE)
 def test_lights_of_any_size(name):
     """E = π L F, F the view factor; with an error of a percent at most."""
@@ -221,7 +219,6 @@ def test_lights_of_any_size(name):
     assert film.error() < 0.01
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["vpl", "path"])
 def test_large_lights_with_textures(estimator):
     """A square of 10⁶, one half of which is black: half of the light of the whole."""
@@ -233,7 +230,6 @@ def test_large_lights_with_textures(estimator):
     assert film.error() < 0.2
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize(
     "light",
     [
