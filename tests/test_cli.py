@@ -225,7 +225,7 @@ def test_interruption_before_the_first_iteration(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interruption_while_loading(tmp_path, monkeypatch, capsys, number, code):
     """Outside of the renderer, too, both signals end the command in one line."""
-    monkeypatch.setattr(warp_ir.usd.load, "StageReader", lambda *args, **kwargs: os.kill(os.getpid(), number))
+    monkeypatch.setattr(warp_ir.usd.load, "StageReader", lambda *args, **kwargs: signal.raise_signal(number))
     assert main(["info", ROOM]) == code
     assert capsys.readouterr().err in ("warp-ir: interrupted\n", "warp-ir: terminated\n")
 
