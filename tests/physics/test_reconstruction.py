@@ -128,10 +128,12 @@ def test_its_bias_vanishes_with_the_noise(device):
 
 
 def test_a_uniform_room_stays_uniform(device):
-    """Where irradiance does not vary the filter changes nothing but the noise."""
+    """Where irradiance does not vary the filter changes nothing but the noise, which it about halves: noise that
+    pixels share stays (0.41 to 0.54 over ten renders: four seeds, 4 to 64 iterations).
+    """
     film = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16, filter=True)
     raw = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16)
-    assert film.radiance().std() < 0.5 * raw.radiance().std()
+    assert film.radiance().std() < 0.6 * raw.radiance().std()
     assert film.radiance().mean() == pytest.approx(2.0, rel=0.01)
 
 

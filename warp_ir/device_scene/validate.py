@@ -63,10 +63,6 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
                 raise InputError(f"{material.name}: {name} must be in [0, {MAX_RADIANCE:g}), is {emission}")
             if image is not None and not max(float(image.pixels.max()), *image.outside) < MAX_RADIANCE:
                 raise InputError(f"{material.name}: texture {image.name}: {name} must be less than {MAX_RADIANCE:g}")
-    brightest = max([0.0, *(max(m.emission) for m in scene.materials), *(max(x.radiance) for x in scene.lights)])
-    if not scene.camera.exposure * brightest < _MAX_EXPOSED_RADIANCE:
-        what = f"exposure {scene.camera.exposure:g} times radiance {brightest:g} exceeds {_MAX_EXPOSED_RADIANCE:g}"
-        raise InputError(f"camera {scene.camera.name!r}: {what}")
     for light in scene.lights:
         if not all(0.0 <= e < MAX_RADIANCE for e in light.radiance):
             raise InputError(f"{light.name}: radiance must be in [0, {MAX_RADIANCE:g}), is {light.radiance}")
@@ -82,6 +78,10 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
                 raise InputError(f"{light.name}: texture must be finite and not negative")
             if not float(texture.max()) * max(light.radiance) < MAX_RADIANCE:
                 raise InputError(f"{light.name}: radiance times texture must be less than {MAX_RADIANCE:g}")
+    brightest = max([0.0, *(max(m.emission) for m in scene.materials), *(max(x.radiance) for x in scene.lights)])
+    if not scene.camera.exposure * brightest < _MAX_EXPOSED_RADIANCE:
+        what = f"exposure {scene.camera.exposure:g} times radiance {brightest:g} exceeds {_MAX_EXPOSED_RADIANCE:g}"
+        raise InputError(f"camera {scene.camera.name!r}: {what}")
 
 
 def _check_material(material: Material) -> None:
