@@ -128,8 +128,9 @@ def test_its_bias_vanishes_with_the_noise(device):
 
 
 def test_a_uniform_room_stays_uniform(device):
-    """Where irradiance does not vary the filter changes nothing but the noise, which it about halves: noise that
-    pixels share stays (0.41 to 0.54 over ten renders: four seeds, 4 to 64 iterations).
+    """Where irradiance does not vary the filter changes nothing but the noise, which it about halves.
+
+    Noise that pixels share stays: 0.41 to 0.54 over ten renders, four seeds, 4 to 64 iterations.
     """
     film = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16, filter=True)
     raw = render(furnace(0.5, shape="cube"), "vpl", device, width=32, height=32, iterations=16)
