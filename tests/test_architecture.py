@@ -48,7 +48,7 @@ USD_LAYERS = [
     ["load"],
     ["__init__"],
 ]
-"""The same for the families of readers and the files of `warp_ir.usd`."""
+"""The packages and files of `warp_ir.usd`, under the same rule as `LAYERS`."""
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 
 
@@ -180,7 +180,7 @@ def test_layout_is_complete():
 
 
 def test_gaps_of_a_layout_are_noticed():
-    """Of three files of one name, in folders of their own, each has to be named."""
+    """Three files of one name, in folders of their own, each have to be named."""
     block = "```\nwarp_ir/  a.py this ·\n          b.py that\nx/        a.py c.py\nx/y/\n  b.py\n```"
     text = f"# A\n\n## Layout\n\n{block}\n\n## B\nz.py\n"
     assert layout(text) == {"a.py", "b.py", "x/a.py", "x/c.py", "x/y/b.py"}

@@ -62,7 +62,7 @@ def error_of(capsys, *args, code=2):
 
 
 def test_clipped_pixels_are_counted(tmp_path, capsys):
-    """Of an .exr with 16 bits; one with 32 bits clips nothing. The statistics hold the warning."""
+    """Pixels that 16-bit EXR files clip are counted, also in the statistics; files of 32 bits clip nothing."""
     stage = tmp_path / "a.usda"
     stage.write_text(DARK % "1e9")
     flags = ["--width", "8", "--iterations", "2", "--light-paths", "16", "--stats", str(tmp_path / "s.json")]

@@ -424,7 +424,7 @@ def test_moving_instances_take_the_memory_of_one_prototype(tmp_path):
 
 
 def test_stored_instances_blur_as_if_written_out(tmp_path, monkeypatch):
-    """The same paths, up to rounding: the pictures agree but for pixels where a ray passes an edge."""
+    """Both trace the same paths, up to rounding: the pictures agree but for pixels where a ray passes an edge."""
     lamp = 'def SphereLight "L" { float inputs:intensity = 30\n double3 xformOp:translate = (0, 2, 3)\n'
     lamp += 'uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
     slow = MOVING["point instances"].replace("(48, 0, 0), (0, 24, 0)", "(12, 0, 0), (-24, 24, 0)")

@@ -61,7 +61,7 @@ def test_values_that_are_no_numbers(tmp_path):
 
 
 def test_other_layers_are_left_alone(tmp_path):
-    """Of an EXR with layers, the colour counts."""
+    """The colour of an EXR file with layers is read."""
     spec = oiio.ImageSpec(1, 1, 5, oiio.FLOAT)
     spec.channelnames = ("R", "G", "B", "A", "Z")
     path = str(tmp_path / "a.exr")

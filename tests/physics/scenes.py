@@ -49,6 +49,18 @@ def ball_over_floor(light):
     )
 
 
+def shadow_of_ball(shadowed, free):
+    """A mask of the ground's pixels whose light the ball of `ball_over_floor` takes, but none on the ball's edge."""
+    ground = shadowed.aov("prim_id") == 0
+    inside = ground.copy()
+    for rows in (-1, 0, 1):
+        for columns in (-1, 0, 1):
+            inside &= np.roll(ground, (rows, columns), (0, 1))
+    under = inside & (shadowed.radiance()[..., 0] < 0.5 * free.radiance()[..., 0])
+    assert under.sum() >= 10
+    return under
+
+
 def pixels(film, which):
     return film.radiance()[which].mean(), film.standard_error()[which].mean()
 

@@ -74,7 +74,7 @@ def test_powers_of_two_of_light_scale_the_film(estimator, exponent, device):
 @pytest.mark.extended
 @pytest.mark.parametrize("exponent", [-90, 80])
 def test_powers_of_two_of_light_scale_a_blurred_film(estimator, exponent, device):
-    """The same through a lens, where pixels are supersampled; the exposure may take the factor back."""
+    """The picture through a lens, whose pixels are supersampled, scales too; the exposure may take the factor back."""
     scene, factor = box_with_lights(), 2.0**exponent
     lens = dataclasses.replace(scene.camera, lens_radius=0.05, focus_distance=2.0)
     scene = dataclasses.replace(scene, camera=lens)

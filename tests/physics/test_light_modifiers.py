@@ -26,6 +26,7 @@ from tests.physics.scenes import (
     lamp_profile,
     over_floor,
     pixels,
+    shadow_of_ball,
     sky_texture,
 )
 from warp_ir.estimators import ESTIMATORS
@@ -235,14 +236,7 @@ def test_light_passes_through_shadowless_meshes(estimator):
     empty = dataclasses.replace(ball_over_floor(LAMP), meshes=ball_over_floor(LAMP).meshes[:1])
     free = render(empty, estimator, **common)
     shadowed = render(ball_over_floor(LAMP), estimator, **common)
-    ground = shadowed.aov("prim_id") == 0
-    # Pixels of the ground whose light the ball takes, but none on its edge.
-    inside = ground.copy()
-    for rows in (-1, 0, 1):
-        for columns in (-1, 0, 1):
-            inside &= np.roll(ground, (rows, columns), (0, 1))
-    under = inside & (shadowed.radiance()[..., 0] < 0.5 * free.radiance()[..., 0])
-    assert under.sum() >= 10
+    under = shadow_of_ball(shadowed, free)
     for change in (dict(shadowless=frozenset({1})), dict(shadows=False)):
         film = render(ball_over_floor(dataclasses.replace(LAMP, **change)), estimator, **common)
         mean, error = pixels(film, under)

@@ -186,7 +186,7 @@ def overhead(kind, above, **size):
 
 
 def rect_form_factor(size, height):
-    """Of a square over a parallel element below its centre (Howell, A Catalog of Configuration Factors)."""
+    """Form factor of a square over a parallel element below its centre (Howell, A Catalog of Configuration Factors)."""
     a = 0.5 * size / height
     return 4.0 / np.pi * a / np.hypot(1.0, a) * np.arctan(a / np.hypot(1.0, a))
 
