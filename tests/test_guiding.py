@@ -7,23 +7,24 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
+import warp_ir.guiding.learn as learn_module
 from tests.physics.closed_form import assert_mean
 from warp_ir import procedural
 from warp_ir.guiding.emitter_selection import POWER_FRACTION, probabilities
-from warp_ir.guiding.importance import importance_by_cell
+from warp_ir.guiding.importance import CellTree, learn_importance
 from warp_ir.guiding.photon_target import nearest_point
-from warp_ir.guiding.probes import trace_camera_probes
+from warp_ir.guiding.probes import Vertices, camera_vertices, light_vertices, trace_camera_probes
 from warp_ir.metrics import z_scores
-from warp_ir.procedural import cornell_box
+from warp_ir.procedural import cornell_box, quad
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind
 from warp_ir.settings import GuidingSettings
-from warp_ir.vpl.guide import CELLS, SIDES
+from warp_ir.vpl.guide import CELLS, SIDES, unguided
 
 pytestmark = pytest.mark.extended
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
-GUIDED = ("guided_emitters", "guided_far_lights", "guided_vpls")
+GUIDED = ("guided_emitters", "guided_far_lights", "guided_paths", "guided_vpls")
 
 
 @pytest.fixture
@@ -100,13 +101,54 @@ def test_noise_is_less(wide, name, gains, device):
 
 
 def test_nothing_changes_where_little_is_gained(device):
-    """In the Cornell box all light matters: learning changes no bit, and for one lamp nothing is learned."""
+    """In the Cornell box most light paths matter: learning changes no bit."""
     how = {"iterations": 2, "width": 64, "height": 64}
-    alone = film_of(cornell_box(), device=device, **how)
+    guided, alone = (film_of(cornell_box(), device=device, guiding=guiding, **how) for guiding in (ALWAYS, None))
+    assert [guided.counts[name] for name in GUIDED] == [0, 0, 0, 0]
     assert not any(name in alone.counts for name in GUIDED)
-    guided = film_of(cornell_box(), device=device, guiding=replace(ALWAYS, min_separation=0.0), **how)
-    assert [guided.counts[name] for name in GUIDED] == [0, 0, 0]
     assert np.array_equal(guided.radiance(), alone.radiance())
+
+
+def corner(bend=2.5):
+    """A corridor with a corner: the lamp is in one leg, and the camera in the other looks away from it.
+
+    It goes 6 m along x to the corner, and `bend` m along y to the lamp; it is 1.5 m wide and 2.4 m high.
+    """
+    inside = [
+        quad("floor", [[0, 0, 0], [6, 0, 0], [6, 1.5, 0], [0, 1.5, 0]]),
+        quad("ceiling", [[0, 0, 2.4], [0, 1.5, 2.4], [6, 1.5, 2.4], [6, 0, 2.4]]),
+        quad("floor of the bend", [[4.5, 1.5, 0], [6, 1.5, 0], [6, 1.5 + bend, 0], [4.5, 1.5 + bend, 0]]),
+        quad("its ceiling", [[4.5, 1.5, 2.4], [4.5, 1.5 + bend, 2.4], [6, 1.5 + bend, 2.4], [6, 1.5, 2.4]]),
+    ]
+    walls = [[0, 0], [6, 0], [6, 1.5 + bend], [4.5, 1.5 + bend], [4.5, 1.5], [0, 1.5]]
+    for k, (a, b) in enumerate(zip(walls, walls[1:] + walls[:1], strict=True)):
+        inside.append(quad(f"wall{k}", [[*a, 0], [*a, 2.4], [*b, 2.4], [*b, 0]]))
+    x, y = 5.25, 1.0 + bend
+    lamp = [[x - 0.2, y - 0.2, 2.39], [x - 0.2, y + 0.2, 2.39], [x + 0.2, y + 0.2, 2.39], [x + 0.2, y - 0.2, 2.39]]
+    materials = (ir.Material("wall", (0.7,) * 3), ir.Material("lamp", (0.5,) * 3, (20.0,) * 3))
+    camera = ir.Camera.look_at((3.0, 0.7, 1.4), (0.0, 0.8, 1.0), up=(0, 0, 1), fov=65.0)
+    return ir.Scene((*inside, quad("lamp", lamp, 1)), materials, camera=camera)
+
+
+def test_one_lamp_round_the_corner(device):
+    """Paths take the corner more often, and the light is the same; from the first iteration on, for a single lamp.
+
+    Over eight pairs of seeds the variance of the mean of the picture is 4 to 12 times less, of 64 iterations each.
+    """
+    plain, guided = (iterations_of(corner(), 32, 64, device, 512, guiding) for guiding in (None, ALWAYS))
+    assert guided[0].launcher.profile.counts["guided_paths"] == 1
+    means, errors = zip(*((a.mean(), a.std(ddof=1) / 8.0) for *_, a in (plain, guided)), strict=True)
+    assert abs(means[0] - means[1]) < 4.0 * float(np.hypot(*errors))
+    assert errors[0] > 1.4 * errors[1]
+
+
+def test_a_guided_furnace(device, monkeypatch):
+    """Light paths that are guided where nothing is gained leave the mean as it is: 1/(1 - ρ), whatever is learned."""
+    monkeypatch.setattr(learn_module, "_MIN_VARIANCE", -1.0)
+    monkeypatch.setattr(learn_module, "_MIN_PATH_GAIN", 0.0)
+    film = film_of(procedural.furnace(0.5), iterations=32, device=device)
+    assert film.counts["guided_paths"] == 1
+    assert_mean(film, 2.0, bias=0.02)
 
 
 def test_short_pictures_are_not_guided(wide):
@@ -181,13 +223,62 @@ def test_where_lines_meet():
     assert np.allclose(nearest_point(square, down, np.ones(4)), 0.0, atol=1e-6)
 
 
-def test_worth_of_cells():
-    """Many VPLs tell the mean of their cell; where there are none, it is that of the cells around."""
+def test_means_of_cells():
+    """Many vertices tell the mean of their cell; where there are none, it is that of the cells around."""
     cell = np.repeat([0, 1], 10**5)
-    table = importance_by_cell(cell, np.ones(2 * 10**5), np.repeat([2.0, 4.0], 10**5))
+    tree = CellTree(cell)
+    means = tree.means(np.repeat([2.0, 4.0], 10**5), tree.levels(np.ones(2 * 10**5)))
+    table = tree.dense(means)
     assert table.shape == (SIDES * CELLS**3,)
     assert np.allclose(table[:2], [2.0, 4.0], rtol=1e-3)
     assert np.isclose(table[CELLS], 3.0, rtol=1e-3) and np.isclose(table[-1], 3.0, rtol=1e-3)
+
+
+def test_importance_solves_the_adjoint_equation():
+    """Of three cells in a row, from which paths step on with the ratio r: V = (J + rJ' + r²J'', ...), not seen at once.
+
+    Vertices of no known continuation count for J alone.
+    """
+    own, r, n = np.array([0.0, 0.0, 8.0]), 0.5, 10**4
+    step = np.array([1, 2, -1])
+    vertices = Vertices(
+        cell=np.tile([0, 5, 10], n),
+        contribution=np.tile(own, n),
+        next=(np.where(step >= 0, step, -1) + np.where(step >= 0, 3 * np.arange(n)[:, None], 0)).reshape(-1),
+        ratio=np.full(3 * n, r),
+        continues=np.tile([True, True, False], n),
+        intensity=np.zeros(3 * n),
+        path=np.full(3 * n, -1),
+        is_first=np.zeros(3 * n, bool),
+    )
+    learned = learn_importance(vertices)
+    assert np.allclose(learned.own[0], own, atol=8.0 / n * 3)
+    assert np.allclose((learned.own[0] + learned.following[0])[:2], [r * r * 8.0, r * 8.0], rtol=1e-2)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_importance_in_a_furnace(number, device):
+    """In a closed sphere J is the same everywhere, and C = ρ/(1 - ρ) J: a VPL of intensity 1 leaves ρ, ρ², ... more.
+
+    Paths are followed for 12 vertices, and importance for 12 segments: ρ¹² = 1/4096 is left out. J of a sphere of radius
+    R is 1/4R² times the weights of the points in view; seven octants of a cube of cells are known from few vertices.
+    """
+    renderer = Renderer(procedural.furnace(0.5), ir.RenderSettings(width=32, height=32, filter=False), device=device)
+    launcher, settings, scene = renderer.launcher, renderer._resolved, renderer.scene
+    probes = trace_camera_probes(scene, renderer._shutter[0].camera, launcher, 1024, settings)
+    guide = unguided(scene, launcher)
+    vertices = camera_vertices(scene, launcher, probes) + light_vertices(
+        guide, launcher, probes, 4096, settings, number
+    )
+    learned = learn_importance(vertices)
+    light = vertices.path >= 0
+    own, following = (x[0][learned.tree.leaf[light]] for x in (learned.own, learned.following))
+    n = light.sum()
+    # A vertex has four connections: J of one is known to its deviation over the root of their number.
+    spread = vertices.contribution[light].std() / n**0.5
+    assert abs(own.mean() - vertices.contribution[light].mean()) < 5.0 * spread
+    # A path goes on with probability 1/2, a standard deviation of 1/2; and what follows is 1/(1 - ρ) of that.
+    assert abs(following.mean() / own.mean() - 1.0) < 5.0 * 2.0 * 0.5 / n**0.5 + 2 * 0.5**11
 
 
 def test_both_halves_of_the_probes_see_the_picture():

@@ -177,13 +177,8 @@ def _positive(value: object) -> bool:
 class GuidingSettings:
     """When light paths are guided (`vpl` only). The mean of the picture does not depend on it; noise and time do."""
 
-    first_iteration: int = 4
-    """Iterations before this one are not guided: learning would take too large a part of a shorter render."""
-    min_separation: float = 0.25
-    """Least distance between emitters, relative to the scene's diagonal, at which guiding is tried.
-
-    Lights that are closer together are usually seen together, or not at all. Lights at infinity always count.
-    """
+    first_iteration: int = 0
+    """Iterations before this one are not guided."""
 
 
 @dataclass(frozen=True, kw_only=True)

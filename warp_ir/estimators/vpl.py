@@ -27,7 +27,7 @@ from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
-from warp_ir.guiding import guiding_applies, learn
+from warp_ir.guiding import learn
 from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
@@ -160,9 +160,7 @@ class VplEstimator:
         self._guide: Guide | None = None
         """The guide, once it has been learned."""
         guiding = settings.guiding
-        self._first_guided = math.inf
-        if guiding is not None and guiding_applies(scene, guiding.min_separation):
-            self._first_guided = guiding.first_iteration
+        self._first_guided = math.inf if guiding is None or not scene.emits else guiding.first_iteration
         if settings.iteration_limit > self._first_guided:
             scratch.launcher.load([warp_ir.guiding.probes])
 

@@ -1,5 +1,5 @@
 """Path guiding for light paths: what a few probe paths tell about where light paths matter to the picture."""
 
-from warp_ir.guiding.learn import guiding_applies, learn
+from warp_ir.guiding.learn import learn
 
-__all__ = ["guiding_applies", "learn"]
+__all__ = ["learn"]

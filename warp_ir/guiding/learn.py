@@ -1,35 +1,50 @@
 """Path guiding for light paths: what a few probe paths tell about where light paths matter to the picture.
 
-Light paths start on emitters in proportion to power. If the camera sees one of a hundred lit rooms, only one in a
-hundred VPLs lights the picture. So one or two thousand camera paths sample random emitters at each of their vertices,
-with shadows, and half as many light paths leave VPLs that are connected with points that the camera sees. From these
-samples are learned
+Light paths start on emitters in proportion to power and are reflected at random. If the camera sees one of a hundred
+lit rooms, or looks away from the door through which all light comes, few of them leave VPLs that light the picture. So
+one or two thousand camera paths sample random emitters at each of their vertices, with shadows, and as many light paths
+are connected with points that the camera sees. From these samples are learned
 
 * the probability of selecting each emitter                            emitter_selection.py
 * the point close to which the light of suns and skies passes          photon_target.py
-* the survival probability of VPLs, by their contribution              importance.py
+* what the picture gains from a light path, wherever it is             importance.py
 
-Half of the samples are learned from; the other half measures the gain, and where that is small, nothing changes. The
-result is a pure function of the scene, the camera, the size of the image and the seed: whoever renders some iterations
-of a picture, or a part of it, learns the same.
+By the last of them paths choose their directions, and VPLs survive; and its variance tells how many paths there should
+be. What is learned from some samples is measured by others, and where the gain is small, nothing changes. The result is
+a pure function of the scene, the camera, the size of the image and the seed: whoever renders some iterations of a
+picture, or a part of it, learns the same.
 """
 
+import math
 from dataclasses import replace
-
-import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import CameraData, DeviceScene
 from warp_ir.guiding.emitter_selection import learn_emitter_probabilities, probe_scene
-from warp_ir.guiding.importance import learn_survival
+from warp_ir.guiding.importance import VplSurvival, learn_importance, learn_survival, path_variance
 from warp_ir.guiding.photon_target import learn_photon_target
-from warp_ir.guiding.probes import connect_vpls, trace_camera_probes
-from warp_ir.scene import LightKind
+from warp_ir.guiding.probes import (
+    CameraProbes,
+    camera_vertices,
+    cells_extent,
+    light_vertices,
+    trace_camera_probes,
+)
 from warp_ir.settings import ResolvedSettings
 from warp_ir.vpl.guide import Guide, unguided
 
 _MIN_CAMERA_PATHS, _MAX_CAMERA_PATHS = 1024, 2048
 """Limits of the number of camera paths, one for every sixteen pixels: they take a small part of an iteration."""
+_LIGHT_PATHS = 1024
+"""Light paths of a probe."""
+_CANDIDATES = 8
+"""Directions that are traced, of which a guided light path takes one."""
+_MIN_VARIANCE = 4.0
+"""Relative variance of a light path's contribution below which nothing is to be gained by guiding."""
+_MIN_PATH_GAIN = 1.2
+"""Least ratio of that variance without guiding to that with it: guided paths take longer to trace."""
+_GATHERING_ERROR = 1.0 / 150.0
+"""Typical squared relative error that gathering leaves in a filtered picture of one iteration."""
 _VPLS_PER_PATH = 1.5
 """Surviving VPLs on surfaces per light path, as in a closed room. Where there are fewer, more paths are started."""
 _MAX_PATHS = 16
@@ -38,33 +53,11 @@ _PIXELS_PER_PATH = 2
 """Least number of pixels per light path: so tracing the paths remains cheap beside gathering."""
 
 
-def guiding_applies(scene: DeviceScene, min_separation: float) -> bool:
-    """Whether there is anything to learn: lights at infinity, emitters far apart, or of very different power.
-
-    Args:
-        scene: The scene.
-        min_separation: `GuidingSettings.min_separation`.
-    """
-    lights, materials = scene.stored.lights, scene.stored.materials
-    if any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in lights):
-        return True
-    if scene.data.uneven:
-        return True
-    positions = [light.world_from_light[:3, 3] for light in lights]
-    emits = np.array([max(material.emission) > 0.0 for material in materials], bool)
-    for mesh in scene.stored.meshes if emits.any() else ():
-        emissive = mesh.triangles[emits[mesh.material]]
-        if len(emissive):
-            points = mesh.points[emissive.reshape(-1)]
-            positions += [points.min(axis=0), points.max(axis=0)]
-    extent = scene.detail_extent / scene.frame.scale
-    return len(positions) > 1 and bool(np.linalg.norm(np.ptp(positions, axis=0)) > min_separation * extent)
-
-
 def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: ResolvedSettings) -> Guide:
     """Traces probe paths, and returns the guide of a view.
 
-    The launcher's counts `guided_emitters`, `guided_far_lights` and `guided_vpls` say what was changed: 1 or 0.
+    The launcher's counts `guided_emitters`, `guided_far_lights`, `guided_paths` and `guided_vpls` say what was changed:
+    1 or 0.
 
     Args:
         scene: The scene.
@@ -75,10 +68,7 @@ def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: 
     guide = unguided(scene, launcher)
     pixels = camera.image_columns * camera.image_rows
     paths = min(max(pixels // 16, _MIN_CAMERA_PATHS), _MAX_CAMERA_PATHS)
-    # VPLs are dropped only where more paths make up for them; else the noise would be lower, but of lower frequency.
-    max_paths = min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MAX_PATHS)
     guided_scene = photon_target = survival = None
-    vpls_per_path = _VPLS_PER_PATH
     if scene.emits:
         probed = probe_scene(scene, launcher)
         probes = trace_camera_probes(probed, camera, launcher, paths, settings)
@@ -86,15 +76,60 @@ def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: 
             guided_scene = learn_emitter_probabilities(scene, probed, probes, launcher)
             photon_target = learn_photon_target(scene, probes, launcher)
             guide = replace(guide, scene=guided_scene or scene, photon_target=photon_target or guide.photon_target)
-            if max_paths > 1:
-                connections = connect_vpls(guide, launcher, probes, paths // 2, settings)
-                survival, vpls_per_path = learn_survival(connections, guide, launcher), connections.per_path
-    if survival is not None:
-        vpls_per_path *= survival.survival_rate
-        guide = replace(guide, importance=survival.importance, density_ratio=survival.density_ratio)
-    if vpls_per_path > 0.0:
-        guide = replace(guide, path_multiplier=max(min(round(_VPLS_PER_PATH / vpls_per_path), max_paths), 1))
-    decisions = {"guided_emitters": guided_scene, "guided_far_lights": photon_target, "guided_vpls": survival}
+        if settings.max_bounces > 0:
+            guide, survival = _guide_paths(guide, launcher, probes, pixels, settings)
+    decisions = {
+        "guided_emitters": guided_scene is not None,
+        "guided_far_lights": photon_target is not None,
+        "guided_paths": guide.importance.candidates > 1,
+        "guided_vpls": survival is not None,
+    }
     for name, result in decisions.items():
-        launcher.profile.counts[name] = int(result is not None)
+        launcher.profile.counts[name] = int(result)
     return guide
+
+
+def _guide_paths(
+    guide: Guide, launcher: Launcher, probes: CameraProbes, pixels: int, settings: ResolvedSettings
+) -> tuple[Guide, VplSurvival | None]:
+    """The guide with what light paths tell: how they go on, how many there are, and which VPLs survive."""
+    probe = light_vertices(guide, launcher, probes, _LIGHT_PATHS, settings, 0)
+    if not probe.contribution.any():
+        return guide, None
+    vertices = camera_vertices(guide.scene, launcher, probes) + probe
+    learned = learn_importance(vertices)
+    variance = path_variance(probe, learned.own_at(len(probe.cell)), _LIGHT_PATHS)
+    if variance <= _MIN_VARIANCE:
+        return guide, None
+    # A first guide finds its way to where light paths without one seldom come; the second is learned from both.
+    first = replace(guide, importance=learned.record(launcher, _CANDIDATES, cells_extent(guide.scene), vertices))
+    guided = light_vertices(first, launcher, probes, _LIGHT_PATHS, settings, 1)
+    vertices = vertices + guided
+    learned = learn_importance(vertices)
+    guided_variance = path_variance(guided, learned.own_at(len(guided.cell)), _LIGHT_PATHS)
+    candidates = 1
+    if variance > _MIN_PATH_GAIN * guided_variance:
+        candidates, probe, variance = _CANDIDATES, guided, guided_variance
+    importance = learned.record(launcher, candidates, cells_extent(guide.scene), vertices)
+    most = max(min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MAX_PATHS), 1)
+    multiplier = _path_multiplier(variance, pixels, settings.light_paths, most)
+    density_ratio, survival = 1.0, None
+    if most > 1:
+        # VPLs are dropped only where more paths make up for them: else noise would be less, but of lower frequency.
+        survival = learn_survival(probe, learned.own_at(len(probe.cell)), guide.scene)
+    if survival is not None:
+        multiplier = max(multiplier, min(round(_VPLS_PER_PATH * _LIGHT_PATHS / survival.survivors), most))
+        importance.survival_threshold = survival.threshold * _LIGHT_PATHS / (multiplier * settings.light_paths)
+        density_ratio = survival.density_ratio
+    guide = replace(guide, importance=importance, path_multiplier=multiplier, density_ratio=density_ratio)
+    return guide, survival
+
+
+def _path_multiplier(variance: float, pixels: int, light_paths: int, most: int) -> int:
+    """Number of light paths to trace for each that is asked for, a power of two.
+
+    The squared error of N light paths is v/N, that of gathering e, and a pixel takes about as long as a light path. So
+    the error at equal time, (v/N + e) (N + pixels), is least for N² = v/e times the number of pixels.
+    """
+    best = math.sqrt(max(variance, 0.0) / _GATHERING_ERROR * pixels)
+    return min(1 << max(round(math.log2(max(best / light_paths, 1.0))), 0), most)

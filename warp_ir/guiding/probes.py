@@ -1,7 +1,7 @@
-"""Probe paths: camera paths that sample emitters, and VPLs that are connected to points that the camera sees."""
+"""Probe paths: camera paths that sample emitters, and light paths; all are connected to points that the camera sees."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,10 @@ from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin, visible
-from warp_ir.vpl.emission import VplBuffer, emit_vpls
+from warp_ir.vpl.emission import trace_light_vertices
 from warp_ir.vpl.guide import CELLS, Guide, cell_of
+
+Floats = npt.NDArray[np.float64]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -31,11 +33,11 @@ _ROWS = wp.constant(_MAX_VERTICES * _EMITTER_SAMPLES)
 _FIRST_DIMENSION = wp.constant(4)  # the dimensions before it are the camera's
 _DIMENSIONS = wp.constant(6)  # sample dimensions per vertex
 _CONNECTIONS = 4
-"""Number of points that the camera sees, to which each VPL is connected."""
+"""Number of points that the camera sees, to which each vertex is connected."""
 _CONNECTION_COUNT = wp.constant(_CONNECTIONS)
 _CELLS = wp.constant(CELLS)
-_MAX_VPLS_PER_PATH = 8
-"""Largest mean number of connected VPLs per light path."""
+_MAX_LIGHT_VERTICES = 12
+"""Largest number of vertices of a light path that is learned from."""
 _CAMERA_PATHS, _LIGHT_PATHS = 1 << 32, (1 << 32) + 1
 """Iteration numbers for the scrambles, larger than those of any render."""
 _TILES = 8
@@ -182,79 +184,123 @@ def _finite(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
-def _connect_vpls(
+def _connect_vertices(
     first: int,
     scene: SceneData,
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
     probes: ProbeRows,
-    vpls: VplBuffer,
-    selected: wp.array[wp.int32],
     extent: float,
     cells: wp.array[wp.int32],
     contribution: wp.array[wp.float32],
 ) -> None:
-    """Connects a VPL on a surface with some of the points that the camera sees, by shadow rays."""
+    """Connects vertex `i` with some of the points that the camera sees, by shadow rays."""
     i = first + wp.tid()
-    vpl = selected[i]
-    target = vpls.position[vpl]
-    position = wp.vec3(target[0], target[1], target[2])
-    normal = wp.vec3(vpls.normal[vpl][0], vpls.normal[vpl][1], vpls.normal[vpl][2])
-    cells[i] = cell_of(position, normal, extent)
+    cells[i] = cell_of(position[i], normal[i], extent)
     # G is bounded at the width of a cell: what is learned of a VPL must hold for others in its cell.
-    edge = extent / float(_CELLS)
+    edge = 0.5 * extent / float(_CELLS)
     paths = wp.uint32(probes.emitter.shape[0] // _ROWS)
+    total = float(0.0)
     for k in range(_CONNECTION_COUNT):
-        row = i * _CONNECTION_COUNT + k
-        contribution[row] = 0.0
-        point = int(sobol.hash_combine(wp.uint32(row), wp.uint32(0)) % paths) * _ROWS
+        point = int(sobol.hash_combine(wp.uint32(i * _CONNECTION_COUNT + k), wp.uint32(0)) % paths) * _ROWS
         if probes.weight[point] > 0.0:
-            to_vpl = position - probes.position[point]
-            squared = wp.dot(to_vpl, to_vpl) + 1.0e-30
-            direction = to_vpl / wp.sqrt(squared)
-            cosines = wp.max(wp.dot(probes.normal[point], direction), 0.0) * wp.max(-wp.dot(normal, direction), 0.0)
+            to_vertex = position[i] - probes.position[point]
+            squared = wp.dot(to_vertex, to_vertex) + 1.0e-30
+            direction = to_vertex / wp.sqrt(squared)
+            cosines = wp.max(wp.dot(probes.normal[point], direction), 0.0)
+            cosines *= wp.max(-wp.dot(normal[i], direction), 0.0)
+            target = wp.vec4(position[i][0], position[i][1], position[i][2], 1.0)
             if cosines > 0.0 and visible(scene, probes.position[point], target):
-                contribution[row] = probes.weight[point] * cosines / wp.max(squared, edge * edge)
+                total += probes.weight[point] * cosines / wp.max(squared, edge * edge)
+    contribution[i] = total / float(_CONNECTION_COUNT)
 
 
 @dataclass(frozen=True)
-class VplConnections:
-    """VPLs on surfaces, and their contributions to the picture."""
+class Vertices:
+    """Vertices of probe paths on surfaces."""
 
     cell: npt.NDArray[np.int64]
-    """[n], the cell of each VPL (`vpl.guide.cell_of`)."""
-    intensity: npt.NDArray[np.float64]
-    """[n], intensity, sum of the channels."""
-    contribution: npt.NDArray[np.float64]
-    """[n], contribution to the picture per intensity."""
-    per_path: float
-    """Mean number of VPLs on surfaces per light path."""
-    extent: float
-    """Edge length of the cube that the cells divide, in the device frame."""
+    """[n], the cell of each vertex (`vpl.guide.cell_of`)."""
+    contribution: Floats
+    """[n], contribution to the picture per intensity of a VPL there."""
+    next: npt.NDArray[np.int64]
+    """[n], index of the path's next vertex; -1: it ends."""
+    ratio: Floats
+    """[n], intensity of a VPL at the next vertex per intensity of one here."""
+    continues: npt.NDArray[np.bool_]
+    """[n], whether it is known how the path goes on."""
+    intensity: Floats
+    """[n], intensity of light paths' VPLs, sum of the channels; 0 on camera paths."""
+    path: npt.NDArray[np.int64]
+    """[n], the light path; -1 on camera paths."""
+    is_first: npt.NDArray[np.bool_]
+    """[n], whether it is the first vertex of a light path."""
+
+    def __add__(self, other: "Vertices") -> "Vertices":
+        """Those of both; light paths with the same number are no longer told apart."""
+        joined = {f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
+        joined["next"][len(self.next) :] += np.where(other.next >= 0, len(self.next), 0)
+        return Vertices(**joined)
 
 
-def connect_vpls(
-    guide: Guide, launcher: Launcher, probes: CameraProbes, paths: int, settings: ResolvedSettings
-) -> VplConnections:
-    """Traces light paths, and connects their VPLs with points that the camera sees."""
-    scene = guide.scene
-    vpls = emit_vpls(
-        guide,
-        Scratch(launcher),
-        light_paths=paths,
-        absorption="roulette",
-        max_bounces=settings.max_bounces,
-        scramble=sobol.iteration_scramble(settings.seed, _LIGHT_PATHS),
+def cells_extent(scene: DeviceScene) -> float:
+    """Edge length of the cube that the cells of a view divide, in the device frame."""
+    return 2.0 * float(scene.data.focus_radius)
+
+
+def _connect(
+    scene: DeviceScene, launcher: Launcher, probes: CameraProbes, position: Floats, normal: Floats
+) -> tuple[npt.NDArray[np.int64], Floats]:
+    """The cells of vertices, and their contributions per intensity."""
+    n = len(position)
+    cells, contribution = launcher.empty(max(n, 1), wp.int32), launcher.empty(max(n, 1), wp.float32)
+    on_device = [launcher.array(x.reshape(-1, 3), wp.vec3) for x in (position, normal)]
+    inputs = [scene.data, *on_device, probes.rows, cells_extent(scene), cells, contribution]
+    launcher.launch(_connect_vertices, n, inputs)
+    return cells.numpy()[:n].astype(np.int64), _finite(contribution.numpy()[:n])
+
+
+def camera_vertices(scene: DeviceScene, launcher: Launcher, probes: CameraProbes) -> Vertices:
+    """The vertices of camera paths: light that arrives there would go on as they do."""
+    rows = probes.rows
+    position, normal = rows.position.numpy()[::_EMITTER_SAMPLES], rows.normal.numpy()[::_EMITTER_SAMPLES]
+    weight, emitter = rows.weight.numpy()[::_EMITTER_SAMPLES], rows.emitter.numpy()[::_EMITTER_SAMPLES]
+    valid = (emitter >= 0).reshape(-1, _MAX_VERTICES)
+    of_path = np.cumsum(valid.reshape(-1)).reshape(valid.shape) - 1
+    following = np.where(valid[:, 1:], of_path[:, 1:], -1)
+    following = np.pad(following, ((0, 0), (0, 1)), constant_values=-1)[valid]
+    # The last vertex that a path can have says nothing about what follows it.
+    continues = np.broadcast_to(np.arange(_MAX_VERTICES) < _MAX_VERTICES - 1, valid.shape)[valid]
+    kept = valid.reshape(-1)
+    weight = _finite(weight)[kept]
+    ratio = np.divide(weight[following], weight, out=np.zeros_like(weight), where=(following >= 0) & (weight > 0.0))
+    cell, contribution = _connect(scene, launcher, probes, position[kept], normal[kept])
+    n = len(cell)
+    nowhere = np.full(n, -1)
+    return Vertices(cell, contribution, following, ratio, continues, np.zeros(n), nowhere, nowhere > 0)
+
+
+def light_vertices(
+    guide: Guide, launcher: Launcher, probes: CameraProbes, paths: int, settings: ResolvedSettings, number: int
+) -> Vertices:
+    """The vertices of light paths on surfaces, as they are with a guide; `number` tells samples of them apart."""
+    longest = min(settings.max_bounces, _MAX_LIGHT_VERTICES)
+    scramble = sobol.iteration_scramble(settings.seed, _LIGHT_PATHS + number)
+    buffer, lengths = trace_light_vertices(
+        guide, Scratch(launcher), paths=paths, max_vertices=longest, scramble=scramble
     )
-    on_surfaces = int(vpls.count.numpy()[0]) - vpls.on_lights
-    n = min(on_surfaces, _MAX_VPLS_PER_PATH * paths)
-    extent = 2.0 * float(scene.data.focus_radius)
-    cells, contribution = launcher.empty(max(n, 1), wp.int32), launcher.empty(max(n, 1) * _CONNECTIONS, wp.float32)
-    selected = vpls.on_lights + np.arange(n) * on_surfaces // max(n, 1)
-    rows = launcher.array(selected, wp.int32)
-    launcher.launch(_connect_vpls, n, [scene.data, probes.rows, vpls, rows, extent, cells, contribution])
-    return VplConnections(
-        cell=cells.numpy()[:n].astype(np.int64),
-        intensity=_finite(vpls.intensity.numpy()[selected]).sum(axis=1),
-        contribution=_finite(contribution.numpy()[: n * _CONNECTIONS]).reshape(n, _CONNECTIONS).mean(axis=1),
-        per_path=on_surfaces / (paths * guide.path_multiplier),
-        extent=extent,
+    length = lengths.numpy()[:paths]
+    number_in_path, path = np.nonzero(np.arange(longest)[:, None] < length)
+    of_row = np.full((longest + 1, paths), -1)
+    of_row[number_in_path, path] = np.arange(len(path))
+    rows = paths * (1 + number_in_path) + path
+    position, normal = (x.numpy()[rows, :3] for x in (buffer.position, buffer.normal))
+    intensity = _finite(buffer.intensity.numpy()[rows]).sum(axis=1)
+    following = of_row[number_in_path + 1, path]
+    ratio = np.divide(
+        intensity[following], intensity, out=np.zeros_like(intensity), where=(following >= 0) & (intensity > 0.0)
+    )
+    cell, contribution = _connect(guide.scene, launcher, probes, position, normal)
+    return Vertices(
+        cell, contribution, following, ratio, np.ones(len(path), bool), intensity, path, number_in_path == 0
     )

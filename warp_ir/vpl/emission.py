@@ -19,11 +19,18 @@ import warp as wp
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import DeviceScene, SceneData
-from warp_ir.lights import PhotonTarget, emit_photon, first_reflection, sample_light
+from warp_ir.lights import EmitterSample, PhotonTarget, emit_photon, first_reflection, sample_light
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
-from warp_ir.surface import albedo, closest, scene_at
-from warp_ir.vpl.guide import Guide, VplImportance, survival_probability
+from warp_ir.surface import Hit, albedo, closest, scene_at
+from warp_ir.vpl.guide import (
+    Guide,
+    ViewImportance,
+    floor_at_emission,
+    floor_from,
+    importance_at,
+    survival_probability,
+)
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -38,6 +45,10 @@ _FIRST_BOUNCE_DIMENSION = wp.constant(7)
 _FIRST_REFLECTION_DIMENSION = wp.constant(1 << 20)  # far from the dimensions of any bounce
 _SURVIVAL_STREAM = wp.constant(wp.uint32(0x9E6C63D0))  # decorrelates the survival of VPLs from the light paths
 _THINNING_STREAM = wp.constant(wp.uint32(0x7FEB352D))  # decorrelates the thinning of VPLs from the light paths
+_CHOICE_STREAM = wp.constant(wp.uint32(0x1B873593))  # decorrelates the choice of a direction from the directions
+# Candidates are the path's own sample, shifted along a lattice that fills the square evenly however many there are
+# (the additive recurrence of the plastic number, Roberts 2018).
+_LATTICE = wp.constant(wp.vec2(0.7548776662466927, 0.5698402909980532))
 _RETRACED_SHARE = 0.02
 """Approximate share of the light paths that are longer than what is recorded of them."""
 _MAX_RECORDED = 2**22
@@ -83,7 +94,7 @@ class LightPathSettings:
     recorded: int  # VPLs of a path that are recorded while it is traced
     capacity: int  # for VPLs on surfaces; if there are more, an even selection of them stands for all
     photon_target: PhotonTarget
-    importance: VplImportance
+    importance: ViewImportance
 
 
 @wp.func
@@ -113,6 +124,87 @@ def _thinning_weight(settings: LightPathSettings, total: int) -> float:
     if total <= settings.capacity:
         return 1.0
     return float(total) / float(settings.capacity)
+
+
+@wp.struct
+class _Segment:
+    """A segment of a light path."""
+
+    hit: Hit  # where it ends
+    direction: wp.vec3
+    flux: wp.vec3  # [W], that arrives
+
+
+@wp.func
+def _shifted(u: wp.vec2, candidate: int) -> wp.vec2:
+    shift = float(candidate) * _LATTICE
+    return wp.vec2(wp.frac(u[0] + shift[0]), wp.frac(u[1] + shift[1]))
+
+
+@wp.func(inline=False)
+def _trace_segment(
+    address: wp.uint64,
+    settings: LightPathSettings,
+    i: int,
+    bounce: int,
+    light: EmitterSample,
+    position: wp.vec3,
+    normal: wp.vec3,
+    flux: wp.vec3,
+) -> _Segment:
+    """Traces the segment of light path `i` before its reflection `bounce`: from the light, or from a surface.
+
+    Where paths are guided, several candidates are traced, and one is taken in proportion to the flux times what the
+    picture gains from it where it arrives (resampled importance sampling, Talbot et al. 2005).
+    """
+    scene = scene_at(address)[0]
+    importance = settings.importance
+    dimension = wp.where(bounce == 1, 3, _FIRST_BOUNCE_DIMENSION + 3 * (bounce - 2))
+    u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
+    v = wp.vec2(0.0)
+    floor = float(0.0)
+    if bounce == 1:
+        v = sobol.sample_2d(scene.sobol, i, 5, settings.scramble)
+        floor = floor_at_emission(importance)
+    elif importance.candidates > 1:
+        floor = floor_from(importance, position, normal)
+    choice = float(0.0)
+    if importance.candidates > 1:
+        choice = _survival_sample(settings.scramble ^ _CHOICE_STREAM, i, bounce)
+    out = _Segment()
+    out.hit.triangle = -1
+    sum_of_weights = float(0.0)
+    weight_of_chosen = float(1.0)
+    for k in range(importance.candidates):
+        origin = position
+        flux_of_candidate = flux
+        if bounce == 1:
+            photon = emit_photon(scene, light, settings.photon_target, _shifted(u, k), _shifted(v, k))
+            origin = photon.origin
+            direction = photon.direction
+            flux_of_candidate = photon.flux
+        else:
+            direction = square_to_cosine_hemisphere(_shifted(u, k), normal)
+        if wp.max(flux_of_candidate) > 0.0:
+            hit = closest(scene, origin, direction, 3.0e38)
+            if hit.triangle >= 0:
+                weight = float(1.0)
+                if importance.candidates > 1:
+                    value = importance_at(importance, hit.position, hit.normal)
+                    mean_flux = flux_of_candidate[0] + flux_of_candidate[1] + flux_of_candidate[2]
+                    weight = wp.max(mean_flux * (value[0] + value[1] + floor), 1.0e-30)
+                sum_of_weights += weight
+                probability = weight / sum_of_weights
+                if choice < probability:
+                    choice = choice / probability
+                    weight_of_chosen = weight
+                    out.hit = hit
+                    out.direction = direction
+                    out.flux = flux_of_candidate
+                else:
+                    choice = (choice - probability) / (1.0 - probability)
+    out.flux = out.flux * (sum_of_weights / (weight_of_chosen * float(importance.candidates)))
+    return out
 
 
 @wp.func(inline=False)
@@ -150,24 +242,18 @@ def _trace_light_path(
         if scene.modifier_count > 0:
             vpls.modifiers[i] = light.modifier_row
 
-    photon = emit_photon(
-        scene,
-        light,
-        settings.photon_target,
-        sobol.sample_2d(scene.sobol, i, 3, settings.scramble),
-        sobol.sample_2d(scene.sobol, i, 5, settings.scramble),
-    )
-    origin = photon.origin
-    direction = photon.direction
-    flux = photon.flux
-    dimension = int(_FIRST_BOUNCE_DIMENSION)
+    origin = wp.vec3(0.0)
+    normal = wp.vec3(0.0)
+    flux = wp.vec3(1.0)
     bounce = int(1)
     vpl_count = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
-        hit = closest(scene, origin, direction, 3.0e38)
+        segment = _trace_segment(scene.address, settings, i, bounce, light, origin, normal, flux)
+        hit = segment.hit
+        flux = segment.flux
         if bounce == 1 and light.modifier_row >= 0:
             u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble)
-            landing = first_reflection(scene, light.modifier_row, hit, direction, u_mesh)
+            landing = first_reflection(scene, light.modifier_row, hit, segment.direction, u_mesh)
             hit = landing.hit
             flux = flux * landing.weight
         if hit.triangle < 0:
@@ -180,14 +266,15 @@ def _trace_light_path(
             flux = wp.cw_mul(flux, rho)
         else:
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
-            if sobol.sample_1d(scene.sobol, i, dimension + 2, settings.scramble) >= survival:
+            dimension = _FIRST_BOUNCE_DIMENSION + 3 * bounce - 1
+            if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble) >= survival:
                 break
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
             break
         intensity = flux * (path_weight / wp.pi)
         survives = bool(True)
-        if settings.importance.known == 1:
+        if settings.importance.survival_threshold > 0.0:
             probability = survival_probability(settings.importance, hit.position, hit.normal, intensity)
             intensity = intensity / probability
             survives = _survival_sample(settings.scramble, i, bounce) < probability
@@ -203,9 +290,7 @@ def _trace_light_path(
                     if scene.uneven == 1:
                         vpls.lift[row] = scene.emitter_lift[light.emitter]
         origin = hit.position
-        u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
-        direction = square_to_cosine_hemisphere(u, hit.normal)
-        dimension += 3
+        normal = hit.normal
         bounce += 1
     return vpl_count
 
@@ -303,13 +388,8 @@ def emit_vpls(
         vpls = _buffer(scene, scratch, "vpls", 0, 0)
         vpls.count.zero_()
         return vpls
-    settings = LightPathSettings()
-    settings.scramble = wp.uint32(scramble)
     paths = light_paths * guide.path_multiplier
-    settings.paths, settings.on_lights = paths, on_lights
-    settings.photon_target, settings.importance = guide.photon_target, guide.importance
-    settings.max_bounces = max_bounces
-    settings.survivors = scratch.array("survivors", 1, wp.int32)
+    settings = _path_settings(guide, scratch, paths, on_lights, max_bounces, scramble)
     if absorption == "fractional":
         alive = survivors(paths, scene.mean_albedo)
         settings.fractional, settings.levels = 1, len(alive)
@@ -329,6 +409,41 @@ def emit_vpls(
     launcher.launch(_store_light_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
     launcher.profile.counts["light_paths"] += paths
     return vpls
+
+
+def _path_settings(
+    guide: Guide, scratch: Scratch, paths: int, on_lights: int, max_bounces: int, scramble: int
+) -> LightPathSettings:
+    """Settings of light paths that end by Russian roulette; what is recorded or stored is left to the caller."""
+    settings = LightPathSettings()
+    settings.scramble = wp.uint32(scramble)
+    settings.paths, settings.on_lights = paths, on_lights
+    settings.photon_target, settings.importance = guide.photon_target, guide.importance
+    settings.max_bounces = max_bounces
+    settings.survivors = scratch.array("survivors", 1, wp.int32)
+    return settings
+
+
+def trace_light_vertices(
+    guide: Guide, scratch: Scratch, *, paths: int, max_vertices: int, scramble: int
+) -> tuple[VplBuffer, wp.array[wp.int32]]:
+    """Traces light paths, and returns their first vertices on surfaces and how many each path has.
+
+    Row `paths` (1 + k) + i of the buffer is the k-th vertex of path i on a surface. The scene must emit.
+
+    Args:
+        guide: The uploaded scene, and how light paths are guided.
+        scratch: Owner of the arrays.
+        paths: Number of light paths.
+        max_vertices: Largest number of vertices of a path; it ends there.
+        scramble: 32-bit scramble of the low-discrepancy sequence.
+    """
+    settings = _path_settings(guide, scratch, paths, paths, max_vertices, scramble)
+    settings.recorded, settings.capacity = max_vertices, paths * max_vertices
+    vertices = _buffer(guide.scene, scratch, "vertices", paths, settings.capacity)
+    lengths = scratch.array("vertices.lengths", paths, wp.int32)
+    scratch.launcher.launch(_trace_light_paths, paths, [guide.scene.data, settings, vertices, lengths])
+    return vertices, lengths
 
 
 def _recorded_length(paths: int, mean_albedo: float) -> int:

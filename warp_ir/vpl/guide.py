@@ -1,11 +1,11 @@
-"""A guide: the probabilities by which light paths start where they matter to the picture; `guiding` learns them.
+"""A guide: the probabilities by which light paths go where they matter to the picture; `guiding` learns them.
 
 A `Guide` holds three kinds of probabilities. Samples are weighted by their inverses, so guiding adds no bias.
 
 * Selection probabilities of emitters: tables of the scene, in `Guide.scene`.
 * The places where photons of lights at infinity enter the scene: `lights.PhotonTarget`.
-* Survival probabilities of VPLs, by their contribution to the picture (Georgiev and Slusallek 2010). The contribution
-  of a VPL is its intensity times the `VplImportance` of the cell of positions and directions that it lies in.
+* The `ViewImportance`, what the picture gains from a VPL and from the path that goes on from it. Of several directions
+  a path takes one in proportion to it, and VPLs survive in proportion to it (Georgiev and Slusallek 2010).
 """
 
 import math
@@ -20,7 +20,7 @@ from warp_ir.lights import PhotonTarget
 
 wp.set_module_options({"enable_backward": False})
 
-CELLS = 32
+CELLS = 16
 """Number of cells along each edge of the cube around the scene."""
 _CELLS = wp.constant(CELLS)
 SIDES = 6
@@ -29,17 +29,24 @@ _MAX_ANNULI = 30
 MIN_SURVIVAL = 0.2
 """Least survival probability of a VPL: no weight grows by more than a factor of five."""
 _MIN_SURVIVAL = wp.constant(MIN_SURVIVAL)
+FLOOR = 0.1
+"""Least weight of a direction that meets a surface, relative to the mean over the directions from where it starts."""
+_FLOOR = wp.constant(FLOOR)
 
 
 @wp.struct
-class VplImportance:
-    """Contribution of VPLs on surfaces to the picture."""
+class ViewImportance:
+    """Contribution to the picture by cell of space and direction, per intensity of a VPL on a surface there.
+
+    It is the solution of the adjoint transport equation: of a VPL itself, and of the VPLs that its path leaves later.
+    """
 
     known: int  # 0: not learned; all VPLs survive
+    candidates: int  # directions from which a light path takes one; 1: light paths are not guided
     extent: float  # edge length of the cube, which is centred at the origin
-    per_intensity: wp.array[
-        wp.float32
-    ]  # [sides, cells, cells, cells]; contribution over the threshold of survival, per intensity
+    per_intensity: wp.array[wp.vec2]  # [sides, cells, cells, cells]; of the VPL itself, and of what follows it
+    at_emission: float  # mean of the sum of both where photons meet their first surface
+    survival_threshold: float  # contribution of a VPL from which on it always survives
 
 
 @wp.func
@@ -57,34 +64,51 @@ def cell_of(position: wp.vec3, normal: wp.vec3, extent: float) -> int:
 
 
 @wp.func
-def survival_probability(importance: VplImportance, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3) -> float:
+def importance_at(importance: ViewImportance, position: wp.vec3, normal: wp.vec3) -> wp.vec2:
+    """Contribution per intensity of a VPL itself, and of what follows it."""
+    return importance.per_intensity[cell_of(position, normal, importance.extent)]
+
+
+@wp.func
+def survival_probability(importance: ViewImportance, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3) -> float:
     """Survival probability of a VPL."""
-    contribution = importance.per_intensity[cell_of(position, normal, importance.extent)] * (
-        intensity[0] + intensity[1] + intensity[2]
-    )
-    return wp.clamp(contribution, _MIN_SURVIVAL, 1.0)
+    contribution = importance_at(importance, position, normal)[0] * (intensity[0] + intensity[1] + intensity[2])
+    return wp.clamp(contribution / wp.max(importance.survival_threshold, 1.0e-30), _MIN_SURVIVAL, 1.0)
+
+
+@wp.func
+def floor_from(importance: ViewImportance, position: wp.vec3, normal: wp.vec3) -> float:
+    """Weight that every direction from a VPL has in addition to its importance: light goes everywhere."""
+    return _FLOOR * importance_at(importance, position, normal)[1]
+
+
+@wp.func
+def floor_at_emission(importance: ViewImportance) -> float:
+    """`floor_from` where light leaves an emitter."""
+    return _FLOOR * importance.at_emission
 
 
 @dataclass(frozen=True)
 class Guide:
-    """Where light paths start, and which of their VPLs survive."""
+    """Where light paths start and go, and which of their VPLs survive."""
 
     scene: DeviceScene
     """The scene, with the selection probabilities of its emitters."""
     photon_target: PhotonTarget
     """Where photons of lights at infinity enter the scene."""
-    importance: VplImportance
-    """Contribution of VPLs, from which their survival probability follows."""
+    importance: ViewImportance
+    """Contribution of VPLs and of what follows them, by which paths are guided and VPLs survive."""
     path_multiplier: int = 1
-    """Number of light paths to trace for each that is asked for, to make up for VPLs that do not survive."""
+    """Number of light paths to trace for each that is asked for, where few of them contribute to the picture."""
     density_ratio: float = 1.0
     """Density of surviving VPLs where they matter, relative to the mean over all surfaces."""
 
 
 def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
     """A guide by which light paths start in proportion to power, and all VPLs survive."""
-    importance = VplImportance()
-    importance.per_intensity = launcher.empty(1, wp.float32)
+    importance = ViewImportance()
+    importance.candidates = 1
+    importance.per_intensity = launcher.empty(1, wp.vec2)
     return Guide(scene, _target_of_details(scene, launcher), importance)
 
 
