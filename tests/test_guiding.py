@@ -1,5 +1,6 @@
 """Light paths go where the camera feels them, and the light is the same."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,6 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
-import warp_ir.guiding.learn as learn_module
 from tests.physics.closed_form import assert_mean
 from warp_ir import procedural
 from warp_ir.guiding.emitter_selection import POWER_FRACTION, probabilities
@@ -144,8 +144,9 @@ def test_one_lamp_round_the_corner(device):
 
 def test_a_guided_furnace(device, monkeypatch):
     """Light paths that are guided where nothing is gained leave the mean as it is: 1/(1 - ρ), whatever is learned."""
-    monkeypatch.setattr(learn_module, "_MIN_VARIANCE", -1.0)
-    monkeypatch.setattr(learn_module, "_MIN_PATH_GAIN", 0.0)
+    learning = sys.modules["warp_ir.guiding.learn"]
+    monkeypatch.setattr(learning, "_MIN_VARIANCE", -1.0)
+    monkeypatch.setattr(learning, "_MIN_PATH_GAIN", 0.0)
     film = film_of(procedural.furnace(0.5), iterations=32, device=device)
     assert film.counts["guided_paths"] == 1
     assert_mean(film, 2.0, bias=0.02)
@@ -260,8 +261,7 @@ def test_importance_solves_the_adjoint_equation():
 def test_importance_in_a_furnace(number, device):
     """In a closed sphere J is the same everywhere, and C = ρ/(1 - ρ) J: a VPL of intensity 1 leaves ρ, ρ², ... more.
 
-    Paths are followed for 12 vertices, and importance for 12 segments: ρ¹² = 1/4096 is left out. J of a sphere of radius
-    R is 1/4R² times the weights of the points in view; seven octants of a cube of cells are known from few vertices.
+    Paths are followed for 12 vertices, and importance for 12 segments: ρ¹² = 1/4096 is left out.
     """
     renderer = Renderer(procedural.furnace(0.5), ir.RenderSettings(width=32, height=32, filter=False), device=device)
     launcher, settings, scene = renderer.launcher, renderer._resolved, renderer.scene

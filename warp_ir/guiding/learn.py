@@ -45,6 +45,8 @@ _MIN_PATH_GAIN = 1.2
 """Least ratio of that variance without guiding to that with it: guided paths take longer to trace."""
 _GATHERING_ERROR = 1.0 / 150.0
 """Typical squared relative error that gathering leaves in a filtered picture of one iteration."""
+_CANDIDATE_PIXELS = 0.25
+"""Time of a candidate at all vertices of a light path, in pixels gathered; the rest of a path takes as long."""
 _VPLS_PER_PATH = 1.5
 """Surviving VPLs on surfaces per light path, as in a closed room. Where there are fewer, more paths are started."""
 _MAX_PATHS = 16
@@ -112,7 +114,8 @@ def _guide_paths(
         candidates, probe, variance = _CANDIDATES, guided, guided_variance
     importance = learned.record(launcher, candidates, cells_extent(guide.scene), vertices)
     most = max(min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MAX_PATHS), 1)
-    multiplier = _path_multiplier(variance, pixels, settings.light_paths, most)
+    path_pixels = _CANDIDATE_PIXELS * (candidates + 1)
+    multiplier = _path_multiplier(variance, pixels / path_pixels, settings.light_paths, most)
     density_ratio, survival = 1.0, None
     if most > 1:
         # VPLs are dropped only where more paths make up for them: else noise would be less, but of lower frequency.
@@ -125,11 +128,11 @@ def _guide_paths(
     return guide, survival
 
 
-def _path_multiplier(variance: float, pixels: int, light_paths: int, most: int) -> int:
+def _path_multiplier(variance: float, pixels: float, light_paths: int, most: int) -> int:
     """Number of light paths to trace for each that is asked for, a power of two.
 
-    The squared error of N light paths is v/N, that of gathering e, and a pixel takes about as long as a light path. So
-    the error at equal time, (v/N + e) (N + pixels), is least for N² = v/e times the number of pixels.
+    The squared error of N light paths is v/N, that of gathering e. So the error at equal time, (v/N + e) (N + pixels),
+    is least for N² = v/e times the number of pixels; `pixels` is how many light paths take the time of gathering.
     """
     best = math.sqrt(max(variance, 0.0) / _GATHERING_ERROR * pixels)
-    return min(1 << max(round(math.log2(max(best / light_paths, 1.0))), 0), most)
+    return min(1 << round(math.log2(max(best / light_paths, 1.0))), most)

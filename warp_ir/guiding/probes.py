@@ -14,6 +14,7 @@ from warp_ir.gbuffer import GBuffer, camera_vertex, new_gbuffer, trace_primary
 from warp_ir.lights import light_visibility, sample_direct, select_emitter
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
+from warp_ir.scene import LightKind
 from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin, visible
 from warp_ir.vpl.emission import trace_light_vertices
@@ -59,7 +60,9 @@ class ProbeRows:
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
-def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, rows: ProbeRows) -> None:
+def _trace_camera_probes(
+    first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, emitter_samples: int, rows: ProbeRows
+) -> None:
     """Traces camera path `i` from what the camera sees, and samples emitters at its vertices."""
     i = first + wp.tid()
     for row in range(i * _ROWS, (i + 1) * _ROWS):
@@ -71,7 +74,7 @@ def _trace_camera_probes(first: int, scene: SceneData, gbuffer: GBuffer, scrambl
     k = int(0)
     while k < _VERTEX_COUNT and x.mesh >= 0 and wp.max(throughput) > 0.0:
         dimension = _FIRST_DIMENSION + _DIMENSIONS * k
-        for j in range(_EMITTER_SAMPLE_COUNT):
+        for j in range(emitter_samples):
             row = (i * _VERTEX_COUNT + k) * _EMITTER_SAMPLE_COUNT + j
             sample = i * _EMITTER_SAMPLE_COUNT + j
             u_emitter = sobol.sample_1d(scene.sobol, sample, dimension, scramble)
@@ -149,7 +152,10 @@ def trace_camera_probes(
     for name, dtype in (("emitter", wp.int32), ("score", wp.float32), ("position", wp.vec3), ("normal", wp.vec3)):
         setattr(rows, name, launcher.empty(n, dtype))
     rows.target, rows.weight = launcher.empty(n, wp.vec4), launcher.empty(n, wp.float32)
-    launcher.launch(_trace_camera_probes, paths, [scene.data, gbuffer, wp.uint32(scramble), rows])
+    # Where there is one light in the scene nothing is learned from its samples but how bright the picture is.
+    is_far = any(light.kind in (LightKind.DISTANT, LightKind.DOME) for light in scene.stored.lights)
+    samples = _EMITTER_SAMPLES if is_far or scene.emitter_source.max(initial=0) > 0 else 1
+    launcher.launch(_trace_camera_probes, paths, [scene.data, gbuffer, wp.uint32(scramble), samples, rows])
 
     emitter, score = rows.emitter.numpy(), _finite(rows.score.numpy())
     bounce = np.arange(n) // _EMITTER_SAMPLES % _MAX_VERTICES
