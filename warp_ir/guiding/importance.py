@@ -103,7 +103,9 @@ class LearnedImportance:
         """J at the last vertices, of cells twice as large as the finest, where it has less noise."""
         return self.own[1][self.tree.parents[0][self.tree.leaf[-last:]]]
 
-    def record(self, launcher: Launcher, candidates: int, extent: float, vertices: Vertices) -> ViewImportance:
+    def record(
+        self, launcher: Launcher, candidates: int, extent: float, vertices: Vertices, contribution: float
+    ) -> ViewImportance:
         """The record for kernels.
 
         Args:
@@ -111,9 +113,10 @@ class LearnedImportance:
             candidates: Number of directions of which a light path takes one.
             extent: Edge length of the cube of cells.
             vertices: The vertices that it was learned from.
+            contribution: Expected contribution of a light path.
         """
         out = ViewImportance()
-        out.known, out.candidates, out.extent = 1, candidates, extent
+        out.known, out.candidates, out.extent, out.path_contribution = 1, candidates, extent, contribution
         table = np.stack([self.tree.dense(self.own), self.tree.dense(self.following)], axis=1)
         out.per_intensity = launcher.array(table, wp.vec2)
         value = (self.own[0] + self.following[0])[self.tree.leaf]

@@ -104,26 +104,31 @@ def _guide_paths(
     if variance <= _MIN_VARIANCE:
         return guide, None
     # A first guide finds its way to where light paths without one seldom come; the second is learned from both.
-    first = replace(guide, importance=learned.record(launcher, _CANDIDATES, cells_extent(guide.scene), vertices))
-    guided = light_vertices(first, launcher, probes, _LIGHT_PATHS, settings, 1)
+    extent, total = cells_extent(guide.scene), float((learned.own_at(len(probe.cell)) * probe.intensity).sum())
+    first = learned.record(launcher, _CANDIDATES, extent, vertices, total / _LIGHT_PATHS)
+    guided = light_vertices(replace(guide, importance=first), launcher, probes, _LIGHT_PATHS, settings, 1)
     vertices = vertices + guided
     learned = learn_importance(vertices)
     guided_variance = path_variance(guided, learned.own_at(len(guided.cell)), _LIGHT_PATHS)
     candidates = 1
     if variance > _MIN_PATH_GAIN * guided_variance:
         candidates, probe, variance = _CANDIDATES, guided, guided_variance
-    importance = learned.record(launcher, candidates, cells_extent(guide.scene), vertices)
     most = max(min(pixels // (_PIXELS_PER_PATH * settings.light_paths), _MAX_PATHS), 1)
     path_pixels = _CANDIDATE_PIXELS * (candidates + 1)
     multiplier = _path_multiplier(variance, pixels / path_pixels, settings.light_paths, most)
+    own = learned.own_at(len(probe.cell))
     density_ratio, survival = 1.0, None
     if most > 1:
         # VPLs are dropped only where more paths make up for them: else noise would be less, but of lower frequency.
-        survival = learn_survival(probe, learned.own_at(len(probe.cell)), guide.scene)
+        survival = learn_survival(probe, own, guide.scene)
     if survival is not None:
         multiplier = max(multiplier, min(round(_VPLS_PER_PATH * _LIGHT_PATHS / survival.survivors), most))
-        importance.survival_threshold = survival.threshold * _LIGHT_PATHS / (multiplier * settings.light_paths)
         density_ratio = survival.density_ratio
+    paths = multiplier * settings.light_paths
+    contribution = float((own * probe.intensity).sum()) / paths
+    importance = learned.record(launcher, candidates, extent, vertices, contribution)
+    if survival is not None:
+        importance.survival_threshold = survival.threshold * _LIGHT_PATHS / paths
     guide = replace(guide, importance=importance, path_multiplier=multiplier, density_ratio=density_ratio)
     return guide, survival
 

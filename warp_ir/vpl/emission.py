@@ -29,6 +29,7 @@ from warp_ir.vpl.guide import (
     floor_at_emission,
     floor_from,
     importance_at,
+    path_survival,
     survival_probability,
 )
 
@@ -266,6 +267,9 @@ def _trace_light_path(
             flux = wp.cw_mul(flux, rho)
         else:
             survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
+            if settings.importance.candidates > 1:
+                reflected = wp.cw_mul(flux, rho) * (path_weight / wp.pi)
+                survival = path_survival(settings.importance, hit.position, hit.normal, reflected, survival)
             dimension = _FIRST_BOUNCE_DIMENSION + 3 * bounce - 1
             if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble) >= survival:
                 break

@@ -29,6 +29,7 @@ _MAX_ANNULI = 30
 MIN_SURVIVAL = 0.2
 """Least survival probability of a VPL: no weight grows by more than a factor of five."""
 _MIN_SURVIVAL = wp.constant(MIN_SURVIVAL)
+_MAX_PATH_SURVIVAL = wp.constant(0.95)
 FLOOR = 0.1
 """Least weight of a direction that meets a surface, relative to the mean over the directions from where it starts."""
 _FLOOR = wp.constant(FLOOR)
@@ -46,6 +47,7 @@ class ViewImportance:
     extent: float  # edge length of the cube, which is centred at the origin
     per_intensity: wp.array[wp.vec2]  # [sides, cells, cells, cells]; of the VPL itself, and of what follows it
     at_emission: float  # mean of the sum of both where photons meet their first surface
+    path_contribution: float  # expected contribution of a light path
     survival_threshold: float  # contribution of a VPL from which on it always survives
 
 
@@ -74,6 +76,20 @@ def survival_probability(importance: ViewImportance, position: wp.vec3, normal: 
     """Survival probability of a VPL."""
     contribution = importance_at(importance, position, normal)[0] * (intensity[0] + intensity[1] + intensity[2])
     return wp.clamp(contribution / wp.max(importance.survival_threshold, 1.0e-30), _MIN_SURVIVAL, 1.0)
+
+
+@wp.func
+def path_survival(
+    importance: ViewImportance, position: wp.vec3, normal: wp.vec3, intensity: wp.vec3, reflectivity: float
+) -> float:
+    """Survival probability of a guided path that would leave a VPL (adjoint-driven roulette, Vorba and Křivánek 2016).
+
+    It is what the VPL and all that follows contribute, relative to a path's expectation; but within limits.
+    """
+    value = importance_at(importance, position, normal)
+    contribution = (value[0] + value[1]) * (intensity[0] + intensity[1] + intensity[2])
+    relative = contribution / wp.max(importance.path_contribution, 1.0e-30)
+    return wp.clamp(relative, _MIN_SURVIVAL * reflectivity, wp.max(reflectivity, _MAX_PATH_SURVIVAL))
 
 
 @wp.func
