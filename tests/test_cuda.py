@@ -179,7 +179,7 @@ def test_guided_iterations_read_nothing_back(name, monkeypatch):
     settings = ir.RenderSettings(width=24, height=24, light_paths=64, iterations=4)
     scene = getattr(wide_scenes, name)()
     expected = Renderer(scene, settings, guiding=guiding).render()
-    assert expected.counts["guided_vpls"] == 1
+    assert expected.counts["guided_paths"] == 1
     renderer = Renderer(scene, settings, guiding=guiding)
     renderer.launcher.synchronous = False
     film = renderer.new_film()

@@ -67,9 +67,9 @@ def variances(scene, device, guiding):
 @pytest.mark.parametrize(
     "name, guided",
     [
-        ("rooms", {"guided_emitters", "guided_vpls"}),
+        ("rooms", {"guided_emitters", "guided_paths"}),
         ("terrain", {"guided_far_lights", "guided_vpls"}),
-        ("house", {"guided_far_lights", "guided_vpls"}),
+        ("house", {"guided_far_lights", "guided_paths", "guided_vpls"}),
     ],
 )
 def test_light_is_the_same(wide, name, guided, device):
@@ -133,13 +133,13 @@ def corner(bend=5.0):
 def test_one_lamp_round_the_corner(device):
     """Paths take the corner more often, and the light is the same; from the first iteration on, for a single lamp.
 
-    Over eight pairs of seeds the variance of the mean of the picture is 4 to 12 times less, of 64 iterations each.
+    Over four pairs of seeds the deviation of the mean of the picture was 5.4 to 6.4 times less, of 64 iterations each.
     """
     plain, guided = (iterations_of(corner(), 32, 64, device, 512, guiding) for guiding in (None, ALWAYS))
     assert guided[0].launcher.profile.counts["guided_paths"] == 1
     means, errors = zip(*((a.mean(), a.std(ddof=1) / 8.0) for *_, a in (plain, guided)), strict=True)
     assert abs(means[0] - means[1]) < 4.0 * float(np.hypot(*errors))
-    assert errors[0] > 1.4 * errors[1]
+    assert errors[0] > 3.0 * errors[1]
 
 
 def test_a_guided_furnace(device, monkeypatch):
@@ -152,10 +152,10 @@ def test_a_guided_furnace(device, monkeypatch):
     assert_mean(film, 2.0, bias=0.02)
 
 
-def test_short_pictures_are_not_guided(wide):
+def test_first_iterations_can_be_left_out(wide):
     """The first iterations are those without a guide; the ones after them are guided."""
     short, long = (film_of(wide.rooms(), iterations=n, guiding=GuidingSettings(first_iteration=2)) for n in (2, 3))
-    assert "guided_vpls" not in short.counts and long.counts["guided_vpls"] == 1
+    assert "guided_paths" not in short.counts and long.counts["guided_paths"] == 1
     plain = [film_of(wide.rooms(), iterations=n, guiding=None).radiance() for n in (2, 3)]
     assert np.array_equal(short.radiance(), plain[0]) and not np.array_equal(long.radiance(), plain[1])
 
@@ -164,7 +164,7 @@ def test_the_same_bits(wide, tmp_path):
     """On any number of threads, resumed, cut from the whole picture, and of a picture rendered again."""
     scene = wide.rooms()
     whole = film_of(scene, iterations=4, threads=1)
-    assert whole.counts["guided_vpls"] == 1
+    assert whole.counts["guided_paths"] == 1
     assert np.array_equal(whole.radiance(), film_of(scene, iterations=4, threads=3).radiance())
     film_of(scene, iterations=2).save(tmp_path / "film.npz")
     settings = ir.RenderSettings(width=24, height=24, filter=False, light_paths=64, iterations=4)
@@ -187,7 +187,7 @@ def test_twice_the_light(wide):
         replace(m, emission=(2 * m.emission[0], 2 * m.emission[1], 2 * m.emission[2])) for m in scene.materials
     )
     film, twice = film_of(scene, iterations=2), film_of(replace(scene, materials=brighter), iterations=2)
-    assert film.counts["guided_vpls"] == twice.counts["guided_vpls"] == 1
+    assert film.counts["guided_paths"] == twice.counts["guided_paths"] == 1
     assert np.array_equal(2.0 * film.radiance(), twice.radiance())
 
 

@@ -35,8 +35,8 @@ from warp_ir.vpl.guide import Guide, unguided
 
 _MIN_CAMERA_PATHS, _MAX_CAMERA_PATHS = 1024, 2048
 """Limits of the number of camera paths, one for every sixteen pixels: they take a small part of an iteration."""
-_LIGHT_PATHS = 1024
-"""Light paths of a probe."""
+_MIN_LIGHT_PATHS, _MAX_LIGHT_PATHS = 512, 1024
+"""Limits of the number of light paths of a probe, one for every eight pixels."""
 _CANDIDATES = 8
 """Directions that are traced, of which a guided light path takes one."""
 _MIN_VARIANCE = 4.0
@@ -95,21 +95,23 @@ def _guide_paths(
     guide: Guide, launcher: Launcher, probes: CameraProbes, pixels: int, settings: ResolvedSettings
 ) -> tuple[Guide, VplSurvival | None]:
     """The guide with what light paths tell: how they go on, how many there are, and which VPLs survive."""
-    probe = light_vertices(guide, launcher, probes, _LIGHT_PATHS, settings, 0)
+    probed = min(max(pixels // 8, _MIN_LIGHT_PATHS), _MAX_LIGHT_PATHS)
+    probe = light_vertices(guide, launcher, probes, probed, settings, 0)
     if not probe.contribution.any():
+        return guide, None
+    variance = path_variance(probe, learn_importance(probe).own_at(len(probe.cell)), probed)
+    if variance <= _MIN_VARIANCE:
         return guide, None
     vertices = camera_vertices(guide.scene, launcher, probes) + probe
     learned = learn_importance(vertices)
-    variance = path_variance(probe, learned.own_at(len(probe.cell)), _LIGHT_PATHS)
-    if variance <= _MIN_VARIANCE:
-        return guide, None
+    variance = path_variance(probe, learned.own_at(len(probe.cell)), probed)
     # A first guide finds its way to where light paths without one seldom come; the second is learned from both.
     extent, total = cells_extent(guide.scene), float((learned.own_at(len(probe.cell)) * probe.intensity).sum())
-    first = learned.record(launcher, _CANDIDATES, extent, vertices, total / _LIGHT_PATHS)
-    guided = light_vertices(replace(guide, importance=first), launcher, probes, _LIGHT_PATHS, settings, 1)
+    first = learned.record(launcher, _CANDIDATES, extent, vertices, total / probed)
+    guided = light_vertices(replace(guide, importance=first), launcher, probes, probed, settings, 1)
     vertices = vertices + guided
     learned = learn_importance(vertices)
-    guided_variance = path_variance(guided, learned.own_at(len(guided.cell)), _LIGHT_PATHS)
+    guided_variance = path_variance(guided, learned.own_at(len(guided.cell)), probed)
     candidates = 1
     if variance > _MIN_PATH_GAIN * guided_variance:
         candidates, probe, variance = _CANDIDATES, guided, guided_variance
@@ -122,13 +124,13 @@ def _guide_paths(
         # VPLs are dropped only where more paths make up for them: else noise would be less, but of lower frequency.
         survival = learn_survival(probe, own, guide.scene)
     if survival is not None:
-        multiplier = max(multiplier, min(round(_VPLS_PER_PATH * _LIGHT_PATHS / survival.survivors), most))
+        multiplier = max(multiplier, min(round(_VPLS_PER_PATH * probed / survival.survivors), most))
         density_ratio = survival.density_ratio
     paths = multiplier * settings.light_paths
     contribution = float((own * probe.intensity).sum()) / paths
     importance = learned.record(launcher, candidates, extent, vertices, contribution)
     if survival is not None:
-        importance.survival_threshold = survival.threshold * _LIGHT_PATHS / paths
+        importance.survival_threshold = survival.threshold * probed / paths
     guide = replace(guide, importance=importance, path_multiplier=multiplier, density_ratio=density_ratio)
     return guide, survival
 
