@@ -142,9 +142,9 @@ def _shifted(u: wp.vec2, candidate: int) -> wp.vec2:
     return wp.vec2(wp.frac(u[0] + shift[0]), wp.frac(u[1] + shift[1]))
 
 
-@wp.func(inline=False)
+@wp.func
 def _trace_segment(
-    address: wp.uint64,
+    scene: SceneData,
     settings: LightPathSettings,
     i: int,
     bounce: int,
@@ -158,7 +158,6 @@ def _trace_segment(
     Where paths are guided, several candidates are traced, and one is taken in proportion to the flux times what the
     picture gains from it where it arrives (resampled importance sampling, Talbot et al. 2005).
     """
-    scene = scene_at(address)[0]
     importance = settings.importance
     dimension = wp.where(bounce == 1, 3, _FIRST_BOUNCE_DIMENSION + 3 * (bounce - 2))
     u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
@@ -249,7 +248,7 @@ def _trace_light_path(
     bounce = int(1)
     vpl_count = int(0)
     while bounce <= settings.max_bounces and wp.max(flux) > 0.0:
-        segment = _trace_segment(scene.address, settings, i, bounce, light, origin, normal, flux)
+        segment = _trace_segment(scene, settings, i, bounce, light, origin, normal, flux)
         hit = segment.hit
         flux = segment.flux
         if bounce == 1 and light.modifier_row >= 0:
