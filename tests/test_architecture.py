@@ -42,7 +42,7 @@ USD_LAYERS = [
     ["lights"],
     ["shading"],
     ["settings"],
-    ["camera_prim", "diagnose", "linking", "time_varying"],
+    ["camera_prim", "diagnose", "linking", "time_varying", "vpl_layers"],
     ["traverse"],
     ["assemble"],
     ["load"],
