@@ -49,7 +49,7 @@ _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
 The extension of OUTPUT chooses the format. .exr (colour, alpha, AOV layers,
-metadata), .hdr, .pfm and .npy hold linear radiance; .png and .jpg are
+metadata), .hdr, .pfm and .npy hold linear radiance; .png, .jpg and .tif are
 tone-mapped. Ctrl-C stops the render and writes the picture so far.
 
 examples:
@@ -144,7 +144,10 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         messages = command.add_argument_group("messages")
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
         messages.add_argument("--verbose", action="store_true", help="print all warnings, and tracebacks of errors")
-    return parser.parse_args(_join_aov_names(argv))
+    args, unknown = parser.parse_known_args(_join_aov_names(argv))
+    if unknown:  # argparse itself would name the help of all commands
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
+    return args
 
 
 def _join_aov_names(argv: Sequence[str]) -> list[str]:
@@ -220,13 +223,13 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         metavar="NAME ...",
         help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files next to it",
     )
-    stops = "brightness of .png and .jpg: each stop doubles the radiance (default: 0)"
+    stops = "brightness of .png, .jpg and .tif: each stop doubles the radiance (default: 0)"
     output.add_argument("--exposure", type=_stops, default=0.0, metavar="STOPS", help=stops)
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
         default=TONEMAPS[0],
-        help="tone curve of .png and .jpg: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
+        help="tone curve of these files: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
@@ -345,7 +348,7 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     group.add_argument("--renderPassPrimPath", dest="render_pass", help=hidden)
     group.add_argument(
         "--purposes",
-        type=_names(_PURPOSES),
+        type=_names(_PURPOSES, spaces=True),
         metavar="NAME[,NAME]",
         help="purposes to draw in addition to 'default': render, proxy, guide (default: those of the RenderSettings,"
         " or render)",
@@ -404,11 +407,11 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _names(known: Collection[str]) -> Callable[[str], list[str]]:
-    """A parser of argument values that are names separated by commas."""
+def _names(known: Collection[str], *, spaces: bool = False) -> Callable[[str], list[str]]:
+    """A parser of argument values that are names separated by commas, or with `spaces` also by blanks."""
 
     def names(text: str) -> list[str]:
-        given = [name.strip() for name in text.split(",") if name.strip()]
+        given = text.replace(",", " ").split() if spaces else [part.strip() for part in text.split(",") if part.strip()]
         for name in given:
             if name not in known:
                 raise argparse.ArgumentTypeError(f"unknown {name!r}; known are {', '.join(known)}")

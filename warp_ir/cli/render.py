@@ -292,7 +292,7 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     )
     if film.rejected:
         say(f"warning: {film.rejected} non-finite samples were replaced")
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
             brightness = "dark" if stops > job.args.exposure else "bright"
