@@ -211,7 +211,7 @@ class Stopped:
     def new_film(self):
         return Interrupted()
 
-    def render(self, film, progress):
+    def render(self, film, progress, **_):
         return film
 
 
