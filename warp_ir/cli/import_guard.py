@@ -14,8 +14,8 @@ def importing() -> Iterator[None]:
     """Delays SIGINT and SIGTERM, and exempts what is imported from garbage collection, until the imports are done.
 
     USD's modules import each other from C++ code, which prints a Python exception and continues: a Ctrl-C would be lost
-    and the command would run to its end. Modules define no garbage; looking for it among their objects, now and in every
-    later collection, would take a sixth of the start.
+    and the command would run to its end. Modules define no garbage; looking for it among their objects, now and in
+    every later collection, would take a sixth of the start.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

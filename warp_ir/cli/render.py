@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 _EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
 """Words of the warnings of a scene that explain a black picture."""
-_WRITE_SECONDS = 5e-7
-"""Approximate time to write a pixel of a picture [s]; a command of several pictures measures it."""
+_WRITE_SECONDS = 0.05, 2.5e-7
+"""Approximate time to load what writes pictures, and to write a pixel [s]; later pictures take what the last one did."""
 _IN_SURFACE = 1e-6
 """Depth in units of the scene's size below which a camera lies in the surface that it sees."""
 
@@ -61,8 +61,8 @@ class _Job:
     reader: "StageReader"
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
-    write_seconds: float = _WRITE_SECONDS
-    """Time to write a pixel of the latest picture [s]."""
+    write_seconds: float | None = None
+    """Time in which the latest picture was written [s]."""
     warned: set[str] = field(default_factory=set)
     """Warnings that have been printed."""
 
@@ -186,7 +186,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 checkpoint.write_if_due()
 
         begin = time.perf_counter()
-        reserve = job.write_seconds * film.width * film.height
+        reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
         renderer.render(film, report, started=started, reserve=reserve)
         render_seconds = time.perf_counter() - begin
     timings = {**film.timings, "load": load_seconds, "render": render_seconds}
@@ -219,7 +219,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 )
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
-        job.write_seconds = timings["write"] / (film.width * film.height)
+        job.write_seconds = timings["write"]
     if not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
@@ -229,7 +229,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     picture_warnings = [*([f"{scene.camera.name}: {blank}"] if blank and not explained else []), *write_warnings]
     picture_warnings += renderer.warnings
     if settings.time_limit is not None and film.iterations == 1 and film.seconds > settings.time_limit:
-        late = f"one iteration, the least, needs {film.seconds:.2g} s"
+        late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
         picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
     if not args.quiet:
         say_warnings(picture_warnings)
