@@ -127,6 +127,14 @@ def test_stats(tmp_path):
     assert found["output"] == [str(tmp_path / "a.png")] and 0.0 < found["error"] < 10.0
 
 
+def test_a_limit_that_no_iteration_fits_gives_one(tmp_path, capsys):
+    """A time limit of a millisecond gives a picture of one iteration, and a warning with the time that it took."""
+    assert main(["render", ROOM, str(tmp_path / "a.png"), *SMALL[:2], *SMALL[4:], "--time-limit", "0.001"]) == 0
+    captured = capsys.readouterr()
+    assert ", 1 iterations in" in captured.out
+    assert re.search(r"--time-limit 0.001: the picture took \S+ s, as one iteration is the least", captured.err)
+
+
 def test_stats_of_frames(tmp_path):
     """With --frames the numbers of each frame are in a list; an error of one iteration is unknown: null."""
     stats = tmp_path / "s.json"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
 """Words of the warnings of a scene that explain a black picture."""
 _WRITE_SECONDS = 0.05, 2.5e-7
-"""Approximate time to load what writes pictures, and to write a pixel [s]; later pictures take what the last one did."""
+"""Approximate time to load what writes pictures, and to write a pixel [s]; a later picture: as the last one."""
 _IN_SURFACE = 1e-6
 """Depth in units of the scene's size below which a camera lies in the surface that it sees."""
 
