@@ -118,10 +118,21 @@ def test_stats(tmp_path):
 
     found = json.loads(stats.read_text(), parse_constant=no_constants)
     assert found["iterations"] == 2 and found["device"] == "cpu" and found["settings"]["light_paths"] == 16
-    assert {"import", "load", "compile", "upload", "write"} <= set(found["timings"])
+    timings = found["timings"]
+    assert {"import", "load", "compile", "upload", "render", "write"} <= set(timings)
+    # The time since the start of the command holds all that happens before the picture is written, each by its name.
+    assert sum(timings[step] for step in ("import", "load", "upload", "render")) <= found["seconds"]
     assert found["loaded"]["triangles"] == 30 and found["counts"]["iterations"] == 2
     assert found["peak_memory_bytes"] > 1 << 20 and found["versions"]["warp_ir"] == warp_ir.__version__
     assert found["output"] == [str(tmp_path / "a.png")] and 0.0 < found["error"] < 10.0
+
+
+def test_a_limit_that_no_iteration_fits_gives_one(tmp_path, capsys):
+    """A time limit of a millisecond gives a picture of one iteration, and a warning with the time that it took."""
+    assert main(["render", ROOM, str(tmp_path / "a.png"), *SMALL[:2], *SMALL[4:], "--time-limit", "0.001"]) == 0
+    captured = capsys.readouterr()
+    assert ", 1 iterations in" in captured.out
+    assert re.search(r"--time-limit 0.001: the picture took \S+ s, as one iteration is the least", captured.err)
 
 
 def test_stats_of_frames(tmp_path):
@@ -208,7 +219,7 @@ class Stopped:
     def new_film(self):
         return Interrupted()
 
-    def render(self, film, progress):
+    def render(self, film, progress, **_):
         return film
 
 

@@ -139,19 +139,31 @@ class Renderer:
             film.add(self._gbuffer, state.exposure, number)
         wp.synchronize_device(self.launcher.device)
 
-    def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:
-        """Adds iterations to a film until one of the settings' limits is reached.
+    def render(
+        self,
+        film: Film | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        *,
+        started: float | None = None,
+        reserve: float = 0.0,
+    ) -> Film:
+        """Adds iterations to a film until one of the settings' limits is reached; at least one.
 
-        SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and
+        The time limit is that of this call: a new film's first look at the scene, learning, filtering and denoising
+        are in it. SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and
         `film.interrupted` is the number of the signal.
 
         Args:
             film: A film from `new_film`, to be continued; None: a new one.
             progress: Called after every iteration.
+            started: `time.perf_counter` from which the time counts, before uploading for example; None: this call.
+            reserve: Time of the limit that the caller needs after this call, for writing the picture for example [s].
         """
+        start = time.perf_counter() if started is None else started
         film = film or self.new_film()
-        start = time.perf_counter() - film.seconds
+        start -= film.seconds
         with cancel_on_signal(self.launcher, film):
+            film.seconds = time.perf_counter() - start
             scheduler = AdaptiveScheduler(film, self.settings, self._is_adaptive())
             profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
@@ -159,11 +171,9 @@ class Renderer:
                 try:
                     self.add_iteration(film, film.iterations)
                     film.seconds = time.perf_counter() - start
-                    spent = profile.since(before)
-                    per_ray = spent["primary"] / (profile.counts["primary_rays"] - rays)
-                    report = scheduler.update(
-                        reserve=self._picture_seconds(film, per_ray), fixed_share=spent["emission"] / spent.total()
-                    )
+                    spent, samples = profile.since(before), profile.counts["primary_rays"] - rays
+                    picture = self._picture_seconds(film, spent["primary"] / samples, spent["film"] / samples)
+                    report = scheduler.update(reserve=reserve + picture, fixed_share=spent["emission"] / spent.total())
                 except Cancelled:
                     break
                 if progress is not None:
@@ -225,11 +235,12 @@ class Renderer:
         limited = settings.time_limit is not None or settings.target_error is not None
         return limited and settings.iterations is None and settings.filter and len(self._shutter) == 1
 
-    def _picture_seconds(self, film: Film, per_ray: float) -> float:
-        """Estimated time to make the picture [s], if a camera ray takes `per_ray` [s]."""
+    def _picture_seconds(self, film: Film, per_ray: float, per_addition: float) -> float:
+        """Estimated time to make the picture [s], if a camera ray and adding a sample to the film take as long [s]."""
         seconds = 0.0
         if film.reconstruction is not None:
-            seconds += per_ray * film.width * film.height * film.reconstruction.passes(film.iterations)
+            rays, additions = film.reconstruction.cost(film.iterations)
+            seconds += film.width * film.height * (rays * per_ray + additions * per_addition)
         if self.settings.denoise:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
@@ -289,7 +300,7 @@ def render(
     device: str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Film:
-    """Renders a scene until one of the settings' limits is reached.
+    """Renders a scene until one of the settings' limits is reached; the time limit is that of the whole call.
 
     SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and `film.interrupted` is
     the number of the signal.
@@ -303,5 +314,6 @@ def render(
     Raises:
         InputError: The scene, the settings or the device cannot be used; the message says why in one line.
     """
+    started = time.perf_counter()
     renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
-    return renderer.render(progress=progress)
+    return renderer.render(progress=progress, started=started)

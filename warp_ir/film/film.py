@@ -41,8 +41,8 @@ class PictureFilter(Protocol):
     def merge(self, other: Self) -> None:
         """Adds the samples of another film's filter."""
 
-    def passes(self, iterations: int) -> float:
-        """Cost of `resolve`, in passes of camera rays through all pixels."""
+    def cost(self, iterations: int) -> tuple[float, float]:
+        """Cost of `resolve` for each pixel, in camera rays and in samples added to the film."""
 
     def resolve(self, film: FilmData, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
         """Direct and indirect radiance, [2, height, width, 3]; with `features` [5, ...], see `Reconstruction`."""
@@ -83,7 +83,7 @@ class Film:
         self.iterations = 0
         """Iterations added; tiles that were not chosen have fewer (`tile_iterations`)."""
         self.seconds = 0.0
-        """Wall time of rendering the iterations [s], without loading and compiling."""
+        """Wall time since the call that rendered it, up to the picture [s]: `render` uploads within this time."""
         self.interrupted = 0
         """Number of the signal that ended the render before its limit; 0: none."""
         self.settings: RenderSettings | None = None
