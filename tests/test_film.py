@@ -1,6 +1,9 @@
 """Films add, and say how sure they are."""
 
+import base64
 import math
+import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +78,36 @@ def test_films_of_different_size_do_not_merge(device):
     dark = Renderer(furnace(0.5, 0.0, level=1), SETTINGS, device=device)
     with pytest.raises(ir.InputError, match="a film with emission and one without"):
         renderer.new_film().merge(dark.new_film())
+
+
+def test_iterations_of_another_scene_are_refused(device):
+    """A film takes iterations of the renderer that made it, and none after the scene was replaced."""
+    renderer = Renderer(furnace(level=1), SETTINGS, device=device)
+    film = renderer.new_film()
+    renderer.add_iteration(film, 0)
+    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+        Renderer(furnace(level=1), SETTINGS, device=device).add_iteration(film, 1)
+    renderer.update(furnace(0.3, level=1))
+    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+        renderer.add_iteration(film, 1)
+
+
+def test_threads_take_turns(device):
+    """Films of one renderer that three threads fill at the same time have the bits of films filled alone."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=24, light_paths=64, iterations=4), device=device)
+    expected = renderer.render().radiance()
+    with ThreadPoolExecutor(3) as threads:
+        films = [threads.submit(renderer.render) for _ in range(3)]
+    for film in films:
+        np.testing.assert_array_equal(film.result().radiance(), expected)
+
+
+def test_a_notebook_shows_picture_time_and_error(device):
+    """The page of a film holds its picture as PNG, and says how many iterations it has and what error."""
+    film = Renderer(furnace(level=1), SETTINGS, device=device).render()
+    page = film._repr_html_()
+    data = base64.b64decode(re.search(r"base64,([^\"]+)", page).group(1))
+    assert data.startswith(b"\x89PNG") and f"{film.iterations} iterations" in page and "estimated error" in page
 
 
 def test_values_that_are_not_finite_stay_out(device):

@@ -43,7 +43,7 @@ class Renderer:
     def __init__(
         self,
         scene: Scene,
-        settings: RenderSettings,
+        settings: RenderSettings | None = None,
         *,
         device: str = "cpu",
         threads: int | None = None,
@@ -53,7 +53,7 @@ class Renderer:
 
         Args:
             scene: What to render.
-            settings: How to render it.
+            settings: How to render it; None: what the scene's file asks for (`Scene.settings`), and else the defaults.
             device: "cpu", "cuda" or "cuda:N".
             threads: CPU threads; by default one per core. The picture does not depend on it.
             guiding: When light paths are guided; None: never.
@@ -61,6 +61,7 @@ class Renderer:
         Raises:
             InputError: The scene, the settings or the device cannot be used.
         """
+        settings = settings or RenderSettings(**scene.settings)
         self.wanted = settings
         """The settings as given; in `settings` the height is definite."""
         if settings.denoise:
@@ -70,6 +71,7 @@ class Renderer:
         self._guiding = guiding
         self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._shutter: list[_ShutterState] = []
+        self._origin: object = None  # of the films of this upload
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
         estimator = ESTIMATORS[settings.estimator]
@@ -82,16 +84,17 @@ class Renderer:
     def update(self, scene: Scene) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.
 
-        Films of the old scene must not be added to afterwards.
+        Nothing can be added to films of the old scene afterwards.
 
         Raises:
             InputError: The scene cannot be used.
         """
-        self.launcher.profile.clear()
-        self._reported = {}, {}
-        self._take_settings(scene)
-        with self.launcher.loading():
-            self._upload(scene)
+        with self.launcher.exclusive:
+            self.launcher.profile.clear()
+            self._reported = {}, {}
+            self._take_settings(scene)
+            with self.launcher.loading():
+                self._upload(scene)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -108,36 +111,47 @@ class Renderer:
 
     def new_film(self) -> Film:
         """An empty film of the size that the settings ask for."""
-        first = self._shutter[0]
-        assert self._layout is not None
-        film = Film(
-            first.camera.columns,
-            first.camera.rows,
-            self.launcher,
-            first.scene.frame,
-            has_emission=self._layout.emission,
-            sees_lights=self._resolved.visible_lights,
-            sees_dome=self._resolved.visible_lights
-            and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
-        )
-        film.settings = self.settings
-        film.emits = any(state.scene.emits for state in self._shutter)
-        if self._resolved.filter:
-            self._gbuffer.tiles = film.tiles
-            film.reconstruction = Reconstruction(
-                self._shutter, self.launcher, self._gbuffer, self._block, self.settings.seed
+        with self.launcher.exclusive:
+            first = self._shutter[0]
+            assert self._layout is not None
+            film = Film(
+                first.camera.columns,
+                first.camera.rows,
+                self.launcher,
+                first.scene.frame,
+                has_emission=self._layout.emission,
+                sees_lights=self._resolved.visible_lights,
+                sees_dome=self._resolved.visible_lights
+                and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
             )
-        return film
+            film.settings, film.origin = self.settings, self._origin
+            film.emits = any(state.scene.emits for state in self._shutter)
+            if self._resolved.filter:
+                self._gbuffer.tiles = film.tiles
+                film.reconstruction = Reconstruction(
+                    self._shutter, self.launcher, self._gbuffer, self._block, self.settings.seed
+                )
+            return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
-        """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
-        self._gbuffer.tiles = film.tiles
-        number = stratum(iteration, len(self._shutter).bit_length() - 1)
-        state = self._shutter[number]
-        state.estimator.estimate(iteration, self._gbuffer)
-        with self.launcher.phase("film"), self.launcher.uninterruptible():  # an iteration is added whole or not at all
-            film.add(self._gbuffer, state.exposure, number)
-        wp.synchronize_device(self.launcher.device)
+        """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number.
+
+        Films of one renderer may be added to from several threads: they take turns.
+
+        Raises:
+            InputError: The film was not made by `new_film` of this renderer for the present scene.
+        """
+        with self.launcher.exclusive:
+            if film.origin is not self._origin:
+                raise InputError("film: is not of this renderer and its present scene; new_film() makes one")
+            self._gbuffer.tiles = film.tiles
+            number = stratum(iteration, len(self._shutter).bit_length() - 1)
+            state = self._shutter[number]
+            state.estimator.estimate(iteration, self._gbuffer)
+            # An iteration is added whole or not at all.
+            with self.launcher.phase("film"), self.launcher.uninterruptible():
+                film.add(self._gbuffer, state.exposure, number)
+            wp.synchronize_device(self.launcher.device)
 
     def render(
         self,
@@ -204,7 +218,7 @@ class Renderer:
             raise InputError(f"scene: shutter has {len(scene.shutter)} samples, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
         uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
-        self._shutter = []
+        self._shutter, self._origin = [], object()
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
@@ -315,5 +329,5 @@ def render(
         InputError: The scene, the settings or the device cannot be used; the message says why in one line.
     """
     started = time.perf_counter()
-    renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
+    renderer = Renderer(scene, settings, device=device)
     return renderer.render(progress=progress, started=started)

@@ -1,8 +1,13 @@
 """The film: a mean, a standard deviation and a count per pixel. Iterations are added, films are merged."""
 
+import base64
+import functools
 import math
 import os
-from typing import Any, Protocol, Self
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +20,7 @@ from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
 from warp_ir.film.storage import FilmState, read_arrays, read_state, reconstruction_names, write_film
 from warp_ir.gbuffer import GBuffer
+from warp_ir.image.io import write_image
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import TILE, Tiles, all_tiles, some_tiles, tile_count
@@ -27,6 +33,21 @@ _RADIANCE = ("emission", "direct", "indirect")
 """The fields of `FilmData` that add up to the radiance."""
 _CLEAN_ITERATIONS = 8
 """Iterations from which the mean albedo and normals have less noise than a denoiser would leave in them."""
+
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def _exclusive(method: "Callable[Concatenate[Film, _P], _R]") -> "Callable[Concatenate[Film, _P], _R]":
+    """A method of `Film` that no other thread disturbs: the film does not change meanwhile, nor do shared buffers."""
+
+    @functools.wraps(method)
+    def alone(film: "Film", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with film._launcher.exclusive:
+            return method(film, *args, **kwargs)
+
+    return alone
 
 
 class PictureFilter(Protocol):
@@ -94,6 +115,8 @@ class Film:
         """Numbers of rays, VPLs and others over all iterations."""
         self.reconstruction: PictureFilter | None = None
         """The filter of the picture; None: the picture is the unfiltered mean."""
+        self.origin: object = None
+        """The renderer's upload of the scene to which its iterations belong; None: it was made without a renderer."""
         self.emits = False
         """Whether anything in the scene emits: then no surface need be black."""
         self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them
@@ -131,6 +154,7 @@ class Film:
             self._skipped += ~self.chosen
             self.tiles.skipped = self._launcher.array(self._skipped, wp.int32)
 
+    @_exclusive
     def merge(self, other: "Film") -> None:
         """Adds another film of the same picture, which must come from other iterations or another seed.
 
@@ -167,6 +191,7 @@ class Film:
         self.choose(self.chosen)
         self.seconds += other.seconds
 
+    @_exclusive
     def radiance(self) -> npt.NDArray[np.float32]:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
@@ -204,6 +229,7 @@ class Film:
             self._resolved = (self.iterations, reconstruction.resolve(self._data, self.iterations, features))
         return self._resolved[1]
 
+    @_exclusive
     def standard_error(self) -> npt.NDArray[np.float32]:
         """Standard error of `radiance` per pixel, float32 [height, width, 3]: √(se² + b²).
 
@@ -229,6 +255,7 @@ class Film:
             error = np.hypot(error, difference * pixels)
         return np.where(n > 1, error, np.float32(np.inf))
 
+    @_exclusive
     def error(self) -> float:
         """Estimated relative RMS error of the picture: √ of the mean of (se² + b²) / (L² + 0.01 m²).
 
@@ -245,12 +272,14 @@ class Film:
             return 1.0
         return math.sqrt(self.squared_errors(filtered=True).sum())
 
+    @_exclusive
     def is_unlit(self) -> bool:
         """Whether the camera sees surfaces that reflect, and no iteration has found any light on them."""
         if not self.emits or not (self._data.albedo.numpy() > 0.0).any():
             return False
         return not (self._data.direct.numpy().any() or self._data.indirect.numpy().any())
 
+    @_exclusive
     def squared_errors(self, *, filtered: bool = False) -> npt.NDArray[np.float64]:
         """Contribution of every tile of 8 x 8 pixels to the square of `error`, [tiles], row by row.
 
@@ -279,6 +308,7 @@ class Film:
             emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
         return np.where(emissive[1:-1, 1:-1, None], np.float32(0.0), difference)
 
+    @_exclusive
     def aov(self, name: str) -> npt.NDArray[Any]:
         """One of `AOV_NAMES`, row 0 at the top.
 
@@ -331,6 +361,17 @@ class Film:
         """Number of samples that were not finite and count as black; 0 unless something is wrong."""
         return int(self._data.rejected.numpy().sum())
 
+    def _repr_html_(self) -> str:
+        """How notebooks show a film: the picture, what it took, and its error."""
+        caption = f"{self.width} x {self.height}, {self.iterations} iterations in {self.seconds:.1f} s"
+        if self.iterations > 1:
+            caption += f", estimated error {100.0 * self.error():.2g} %"
+        with tempfile.TemporaryDirectory() as folder:
+            (picture,) = write_image(Path(folder) / "film.png", self)
+            data = base64.b64encode(picture.read_bytes()).decode("ascii")
+        return f'<img src="data:image/png;base64,{data}" alt="{caption}"><br>{caption}'
+
+    @_exclusive
     def save(self, path: str | os.PathLike[str], key: str = "") -> None:
         """Writes the film and the samples of its filter as .npz; `load` and `resume` restore it bit for bit.
 
