@@ -21,6 +21,7 @@ from typing import NoReturn
 
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import say
+from warp_ir.image.io import check_input
 from warp_ir.scene import InputError
 
 _LOADED = time.perf_counter()
@@ -61,6 +62,7 @@ def main(argv: Sequence[str] | None = None, started: float | None = None) -> int
     previous_handler = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
         args = parse(argv)
+        check_input(args.stage, "a USD file")  # before anything is imported that takes time
         args.started = started
         code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
         sys.stdout.flush()

@@ -181,6 +181,22 @@ def aov_path(path: Path, aov: str) -> Path:
     return path.with_name(f"{path.stem}.{aov}{path.suffix}")
 
 
+def check_input(path: str | os.PathLike[str], kind: str) -> None:
+    """Checks that a file can be read, as far as that costs no time.
+
+    Args:
+        path: The file.
+        kind: What it should be, such as "a USD file".
+
+    Raises:
+        InputError: There is no such file, or it is a folder.
+    """
+    if not os.path.exists(path):
+        raise InputError(f"{os.fspath(path)}: no such file")
+    if os.path.isdir(path):
+        raise InputError(f"{os.fspath(path)}: is a directory, not {kind}")
+
+
 def check_output(
     path: str | os.PathLike[str], suffixes: Sequence[str] = SUFFIXES, *, make_folder: bool = False
 ) -> Path:
