@@ -325,6 +325,7 @@ def test_the_process_ends_in_order(stage, code):
         (["compare", ROOM, "--methods", "vpl, magic"], "unknown 'magic'; known are vpl, vpl without filter"),
         (["compare", ROOM, "--methods", ","], "--methods: names no method"),
         (["compare", ROOM, "--iterations", "4"], "--iterations 4 (see warp-ir compare --help)"),
+        (["render", ROOM, "a.png", "--threads", "0"], "--threads: must be a whole number from 1 to 1000"),
         (["vpls", ROOM, "a.npz", "--paths"], "--paths: has no effect on .npz"),
         (["vpls", ROOM, "a.png", "--as-lights"], "--as-lights: needs a .usda file"),
         (["vpls", ROOM, "a.usda", "--contribution-to", "3,4"], "--contribution-to: has no effect on .usda"),

@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None, started: float | None = None) -> int
     """
     started = time.perf_counter() if started is None else started
     argv = sys.argv[1:] if argv is None else list(argv)
-    verbose = "--verbose" in argv
+    verbose = "--verbose" in argv or "-v" in argv
     # A file name that the terminal cannot encode must not raise an error.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -143,7 +143,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         fill(command)
         messages = command.add_argument_group("messages")
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
-        messages.add_argument("--verbose", action="store_true", help="print all warnings, and tracebacks of errors")
+        messages.add_argument("--verbose", "-v", action="store_true", help="print all warnings, and tracebacks of errors")
     args, unknown = parser.parse_known_args(_join_aov_names(argv))
     if unknown:  # argparse itself would name the help of all commands
         raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
@@ -241,6 +241,8 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
     _add_device(output)
+    threads = "CPU threads (default: one for each core); the picture does not depend on it"
+    output.add_argument("--threads", type=_count, metavar="N", help=threads)
 
 
 def _add_info(parser: argparse.ArgumentParser) -> None:

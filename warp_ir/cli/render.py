@@ -174,7 +174,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
         else:
-            job.renderer = ir.Renderer(scene, settings, device=job.device)
+            job.renderer = ir.Renderer(scene, settings, device=job.device, threads=job.args.threads)
         renderer, film = job.renderer, job.renderer.new_film()
         checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint)
         if args.resume and checkpoint.resume():
