@@ -8,6 +8,7 @@ are float64, so that a scene far from the origin keeps its detail until it is up
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +64,7 @@ class Texture:
     transform: Floats = field(default_factory=lambda: np.eye(2, 3))
     """float64 [2, 3]: (s, t) = transform (u, v, 1). (0, 0) is the image's lower left corner, (1, 1) its upper right."""
 
-    @property
+    @cached_property
     def mean(self) -> Color:
         """Mean of the pixels; an image of one channel is grey."""
         red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
