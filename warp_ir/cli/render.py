@@ -270,6 +270,8 @@ def _blank_picture(scene: Scene, film: "Film") -> str:
     size = max(scene.extent, float(abs(scene.camera.world_from_camera[:3, 3]).max()))
     if hit.all() and film.aov("depth").max() <= _IN_SURFACE * size:
         return "the camera lies in a surface: the picture is black"
+    if not film.aov("albedo").any():
+        return "the surfaces that the camera sees reflect nothing: the picture is black"
     return "no light reaches what the camera sees, from outside a closed room for example: the picture is black"
 
 

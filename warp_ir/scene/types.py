@@ -8,6 +8,7 @@ are float64, so that a scene far from the origin keeps its detail until it is up
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -91,7 +92,7 @@ class Texture:
     def __post_init__(self) -> None:
         keep_read_only(self, f"texture {self.name!r}", ("pixels", "transform"))
 
-    @property
+    @cached_property
     def mean(self) -> Color:
         """Mean of the pixels; an image of one channel is grey."""
         red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
