@@ -143,7 +143,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         fill(command)
         messages = command.add_argument_group("messages")
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
-        messages.add_argument("--verbose", "-v", action="store_true", help="print all warnings, and tracebacks of errors")
+        more = "print all warnings, and tracebacks of errors"
+        messages.add_argument("--verbose", "-v", action="store_true", help=more)
     args, unknown = parser.parse_known_args(_join_aov_names(argv))
     if unknown:  # argparse itself would name the help of all commands
         raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
