@@ -345,7 +345,8 @@ def _thing(draw: _Draw, size: float, triangles: float, material: int) -> list[Me
             if shape == 3:
                 wave = np.sin(points @ draw.rng.uniform(-6.0, 6.0, (3, 3)) / size + draw.rng.uniform(0.0, 6.0, 3))
                 points = points * (0.85 + 0.15 * wave.prod(axis=1))[:, None]
-            parts = [mesh("ball", points - (0.0, 0.0, points[:, 2].min()), faces, material)]
+            ball = mesh("ball", points - (0.0, 0.0, points[:, 2].min()), faces, material)
+            parts = [replace(ball, uvs={"st": _planar(ball)})]
     return [replace(part, points=part.points @ turned.T) for part in parts]
 
 

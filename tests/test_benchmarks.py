@@ -116,7 +116,7 @@ def test_compare_fails_if_it_has_become_worse(tmp_path, monkeypatch, factor, cod
     """The exit code is 1 if time x error exceeds the earlier result by 10 %: here the earlier one is `factor` of it."""
     import run
 
-    monkeypatch.setattr(run, "measure_all", lambda *_: ([{**row(), "timings": {}, "counts": {}}], [], {}))
+    monkeypatch.setattr(run, "measure_all", lambda *_, **__: ([{**row(), "timings": {}, "counts": {}}], [], {}))
     old = tmp_path / "old.json"
     old.write_text(json.dumps({"rows": [row(error=0.01 * factor)]}))
     assert run.main(["-k", "furnace_cube", "--estimators", "path", "--compare", str(old)]) == code
@@ -149,3 +149,67 @@ def test_the_wrinkled_ball_is_closed():
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
     _, counts = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
     assert (counts % 2 == 0).all()
+
+
+def test_random_scenes_are_functions_of_their_seed():
+    """A seed gives the same scene each time, another seed another, and ten in a row one of each kind."""
+    from make_references import content_digest
+    from random_scenes import KINDS, random_scene
+
+    scenes = [random_scene(seed) for seed in range(20, 30) if seed % 10 != 8]  # the crowd takes a second
+    assert [scene.name.split("_")[0] for scene in scenes] == [kind for kind in KINDS if kind != "crowd"]
+    assert content_digest(scenes[0]) == content_digest(random_scene(20)) != content_digest(random_scene(30))
+    for scene in scenes:
+        assert scene.lights or any(max(material.emission) > 0.0 for material in scene.materials)
+        assert 300 < scene.triangle_count < 20_000
+
+
+@pytest.mark.extended
+def test_random_scenes_are_lit_and_seen():
+    """What rays against boxes say about a scene, its picture confirms: light comes to where the camera looks."""
+    from random_scenes import random_scene
+
+    import warp_ir as ir
+
+    for seed in (40, 42, 45, 47):
+        settings = ir.RenderSettings(width=16, height=16, iterations=64, filter=False)
+        picture = ir.render(random_scene(seed), settings).radiance().mean(axis=2)
+        assert (picture > 0.0).mean() > 0.6
+        assert np.isfinite(picture).all()
+
+
+def test_patterns_stand_out_from_noise():
+    """White noise has no peak; a tenth of its power in one frequency is one.
+
+    The largest of n exponential variables exceeds log(n) + 7 in 0.1 % of all cases; a wave of the amplitude a among
+    N values of the variance 1 has the power N a²/4 relative to the mean.
+    """
+    from perception import pattern_peak
+
+    random = np.random.default_rng(3)
+    reference = np.full((128, 128, 3), 0.5)
+    noise = random.normal(size=(128, 128, 1)) * np.ones(3)
+    assert pattern_peak(reference + noise, reference) < math.log(128 * 128 / 2) + 7.0
+    y, x = np.mgrid[:128, :128]
+    wave = math.sqrt(0.2) * np.sin(2.0 * math.pi * (40 * x + 24 * y) / 128)[..., None]
+    expected = 128**2 * 0.2 / 4.0
+    assert 0.5 * expected < pattern_peak(reference + noise + wave, reference) < 1.5 * expected
+
+
+def test_meshes_are_merged_by_material():
+    """The peer gets one shape for each material: the same triangles, in the same places."""
+    from make_references import merged
+
+    from warp_ir.procedural import cornell_box
+
+    meshes = cornell_box().meshes
+    few = merged(meshes)
+    assert len(few) == 4 < len(meshes)
+    for found in few:
+        assert len(set(found.material.tolist())) == 1
+
+    def corners(parts):
+        rows = np.concatenate([mesh.points[mesh.triangles].reshape(-1, 9) for mesh in parts])
+        return rows[np.lexsort(rows.T)]
+
+    np.testing.assert_array_equal(corners(few), corners(meshes))
