@@ -259,7 +259,8 @@ def main(arguments: list[str] | None = None) -> int:
     worse = False
     if options.compare is not None:
         old = json.loads(options.compare.read_text())
-        table, worse = compare(rows, old.get("error", old)["rows"])
+        old_rows = [row for part in (old, old.get("error", {}), old.get("random", {})) for row in part.get("rows", [])]
+        table, worse = compare(rows, old_rows)
         tables.append(table)
     present = [table for table in tables if table is not None]
     publish(present, results, json_path=options.json, markdown_path=options.markdown)
