@@ -1,6 +1,6 @@
 """Scenes from a seed: houses, corridors, clutter, lamps, windows, which nobody can have tuned a renderer to.
 
-    python benchmarks/random_scenes.py SEED ...    # what the scenes hold
+    python benchmarks/random_scenes.py SEED ... [--usd FOLDER]    # what the scenes hold; also as stages
 
 `KINDS[seed % 10]` decides what is asked, and the generator draws the rest: any ten consecutive seeds ask one of each
 kind. Units are metres, Z is up. A draw counts if it is seen and lit, which a few rays against the bounding boxes of its
@@ -16,10 +16,12 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warp_ir.image import write_image
 from warp_ir.procedural import cube, mesh, quad, sphere
 from warp_ir.scene import Camera, Color, Floats, Ints, Light, LightKind, Material, Mesh, Scene, Texture
 
@@ -577,11 +579,100 @@ def random_scene(seed: int) -> Scene:
     raise RuntimeError(f"seed {seed}: none of {_DRAWS} draws is seen and lit")
 
 
+def write_usd(scene: Scene, path: Path) -> None:
+    """Writes a random scene as a stage, its textures beside it: `load_usd` reads the same scene from it."""
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    looks = []
+    for material in scene.materials:
+        look = UsdShade.Material.Define(stage, f"/World/Looks/{material.name}")
+        surface = UsdShade.Shader.Define(stage, look.GetPath().AppendChild("Surface"))
+        surface.CreateIdAttr("UsdPreviewSurface")
+        diffuse = surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+        diffuse.Set(Gf.Vec3f(*material.albedo))
+        if material.albedo_texture is not None:
+            file = path.with_name(f"{path.stem}_{material.name}.png")
+            write_image(file, material.albedo_texture.pixels)
+            image = UsdShade.Shader.Define(stage, look.GetPath().AppendChild("Texture"))
+            image.CreateIdAttr("UsdUVTexture")
+            image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./{file.name}")
+            image.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+            for wrap in ("wrapS", "wrapT"):
+                image.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("repeat")
+            reader = UsdShade.Shader.Define(stage, look.GetPath().AppendChild("St"))
+            reader.CreateIdAttr("UsdPrimvarReader_float2")
+            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+            coordinates = image.CreateInput("st", Sdf.ValueTypeNames.Float2)
+            coordinates.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+            diffuse.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+        surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*material.emission))
+        surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
+        surface.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
+        surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+        look.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+        looks.append(look)
+    for part in scene.meshes:
+        prim = UsdGeom.Mesh.Define(stage, f"/World/{part.name}")
+        prim.CreatePointsAttr(part.points.astype(np.float32))
+        prim.CreateFaceVertexCountsAttr([3] * len(part.triangles))
+        prim.CreateFaceVertexIndicesAttr(part.triangles.reshape(-1).astype(np.int32))
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        if "st" in part.uvs:
+            kind = Sdf.ValueTypeNames.TexCoord2fArray
+            primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+            primvar.Set(part.uvs["st"].reshape(-1, 2))
+        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(looks[int(part.material[0])])
+    for light in scene.lights:
+        scale, kind = light.radiance, light.kind
+        given: dict[str, float] = {}
+        match kind:
+            case LightKind.RECT:
+                prim, given = UsdLux.RectLight, {"width": light.width, "height": light.height}
+            case LightKind.DISK:
+                prim, given = UsdLux.DiskLight, {"radius": light.radius}
+            case LightKind.SPHERE:
+                prim, given = UsdLux.SphereLight, {"radius": light.radius}
+            case LightKind.CYLINDER:
+                prim, given = UsdLux.CylinderLight, {"radius": light.radius, "length": light.length}
+            case LightKind.DISTANT:
+                prim, given = UsdLux.DistantLight, {"angle": light.angle}
+            case LightKind.POINT:  # the limit of spheres of the same power: intensity / 4, if that is normalized
+                prim, given = UsdLux.SphereLight, {"normalize": True}
+                scale = tuple(4.0 * channel for channel in scale)
+            case _:
+                prim = UsdLux.DomeLight
+        defined = prim.Define(stage, f"/World/{light.name}")
+        defined.CreateColorAttr(Gf.Vec3f(*(channel / max(scale) for channel in scale)))
+        defined.CreateIntensityAttr(max(scale))
+        if kind is LightKind.POINT:
+            defined.CreateTreatAsPointAttr(True)
+        for name, number in given.items():
+            defined.GetPrim().GetAttribute(f"inputs:{name}").Set(number)
+        UsdGeom.Xformable(defined).AddTransformOp().Set(Gf.Matrix4d(light.world_from_light.T.tolist()))
+    eye = UsdGeom.Camera.Define(stage, "/World/main_cam")
+    left, right, bottom, top = scene.camera.fit(1, 1).window
+    eye.CreateHorizontalApertureAttr(right - left)
+    eye.CreateVerticalApertureAttr(top - bottom)
+    eye.CreateFocalLengthAttr(1.0)
+    eye.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
+    UsdGeom.Xformable(eye).AddTransformOp().Set(Gf.Matrix4d(scene.camera.world_from_camera.T.tolist()))
+    stage.SetDefaultPrim(stage.GetPrimAtPath("/World"))
+    stage.GetRootLayer().Save()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("seeds", type=int, nargs="+", metavar="SEED")
-    for seed in parser.parse_args().seeds:
+    parser.add_argument("--usd", type=Path, metavar="FOLDER", help="also write the scenes as stages to this folder")
+    options = parser.parse_args()
+    for seed in options.seeds:
         scene = random_scene(seed)
+        if options.usd is not None:
+            options.usd.mkdir(parents=True, exist_ok=True)
+            write_usd(scene, options.usd / f"{scene.name}.usda")
         print(f"{scene.name}: {scene.triangle_count} triangles, {len(scene.meshes)} meshes, {len(scene.lights)} lights")
 
 

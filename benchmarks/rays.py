@@ -23,6 +23,7 @@ from report import Table, environment, number, publish
 
 import warp_ir as ir
 from warp_ir.device.launcher import Launcher
+from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
 from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
@@ -207,7 +208,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
     trace_primary(uploaded, camera, launcher, gbuffer, iteration=0, seed=0)
     vpls = emit_vpls(
         unguided(uploaded, launcher),
-        launcher,
+        Scratch(launcher),
         light_paths=PATHS,
         absorption="roulette",
         max_bounces=settings.max_bounces,

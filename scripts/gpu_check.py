@@ -5,17 +5,18 @@
     python scripts/gpu_check.py --device cpu --quick                # a rehearsal
 
 Every step is a process of its own with a time box, so that one that hangs or crashes costs only its box. Results are
-written as they come: `results.jsonl` (a line each) and `summary.md` in `out/gpu_check/`. The exit code is 1 if a check
-failed. Kernels are kept in `out/kernels/`, which can be carried from machine to machine. Warp looks them up there by
-the hash of their source and options, the architecture and the format, none of which depends on the machine; the format
-is fixed to machine code (cubin) here, because Warp would otherwise take PTX for compute_75 where the driver is new.
+written as they come: `results.jsonl` (a line each), `summary.md` and what the steps print, in `out/gpu_check/`. The
+exit code is 1 if a check failed. Kernels are kept in `out/kernels/` (or WARP_CACHE_PATH), which can be carried from
+machine to machine. Warp looks them up there by the hash of their source and options, the architecture and the format,
+none of which depends on the machine; the format is fixed to machine code (cubin) here, because Warp would otherwise
+take PTX for compute_75, which the driver then compiles.
 """
 
 import argparse
+import gc
 import importlib
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -26,7 +27,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-OUT, KERNELS = ROOT / "out" / "gpu_check", ROOT / "out" / "kernels"
+KERNELS = ROOT / "out" / "kernels"
 SETTINGS = {"width": 48, "height": 48, "iterations": 2}
 REPEATS = 8
 """Seeds of a picture whose mean two devices must agree on."""
@@ -129,7 +130,8 @@ def leaks(options: argparse.Namespace) -> Iterator[Record]:
     for name, (points, triangles) in {"cube": cube(), "ball": sphere(level=2), "fine ball": sphere(level=6)}.items():
         for shift in (0.0, 0.4, 1e3):
             scene = Scene((mesh(name, points + shift, triangles),))
-            data = upload_scene(scene, launcher).data
+            uploaded = upload_scene(scene, launcher)  # owns what its data refers to
+            data = uploaded.data
             corners = data.points.numpy()[data.indices.numpy().reshape(-1, 3)]
             chosen = corners[random.integers(len(corners), size=count)]
             share = np.round(random.random((count, 1)) * 1.5, 3).clip(0.0, 1.0)  # a third end at a vertex
@@ -197,12 +199,13 @@ def speed(options: argparse.Namespace) -> Iterator[Record]:
     def used() -> int:
         if device.is_cuda:
             return int(device.total_memory - device.free_memory)
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     scenes = {"cornell box": cornell_box(), "crowd": random_scene(8), "lamps": random_scene(9)}
     for name, scene in scenes.items():
         for more in ({}, {"filter": False}, {"estimator": "path"}):
             settings = ir.RenderSettings(width=width, height=height, iterations=iterations, **more)
+            gc.collect()
             before = used()
             renderer = Renderer(scene, settings, device=options.device)
             film = renderer.new_film()
@@ -306,20 +309,20 @@ def _configure_warp() -> None:
     wp.config.log_level = wp.LOG_WARNING
 
 
-def run_step(name: str, options: argparse.Namespace) -> None:
+def run_step(name: str, options: argparse.Namespace, out: Path) -> None:
     """Runs a step in this process; its records go to the file as they come."""
     _configure_warp()
-    with (OUT / "results.jsonl").open("a") as file:
+    with (out / "results.jsonl").open("a") as file:
         begin = time.perf_counter()
         for record in STEPS[name][0](options):
             file.write(json.dumps({"step": name, "at": round(time.perf_counter() - begin, 2), **record}) + "\n")
             file.flush()
 
 
-def summary(ended: dict[str, str]) -> tuple[str, bool]:
+def summary(ended: dict[str, str], out: Path) -> tuple[str, bool]:
     """The results as Markdown, and whether all checks passed."""
     lines, good = ["# GPU check", ""], all(not how.startswith("exit") for how in ended.values())
-    records = [json.loads(line) for line in (OUT / "results.jsonl").read_text().splitlines()]
+    records = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
     for step, how in ended.items():
         own = [r for r in records if r["step"] == step]
         failed = [r for r in own if not r.get("ok", True)]
@@ -338,6 +341,9 @@ def main() -> int:
     parser.add_argument("--device", default="cuda:0", help="cuda:N, or cpu to rehearse (default: cuda:0)")
     parser.add_argument("--minutes", type=float, default=8.0, help="limit, by which time boxes scale (default: 8)")
     parser.add_argument("--only", nargs="+", choices=STEPS, default=list(STEPS), help="steps to run (default: all)")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "out" / "gpu_check", help="folder of the results (default: out/gpu_check)"
+    )
     parser.add_argument("--quick", action="store_true", help="small sizes, to see whether the program runs")
     parser.add_argument("--compile-for", metavar="sm_NN", help="only compile the kernels for an architecture")
     parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)  # how a step's process is started
@@ -345,11 +351,12 @@ def main() -> int:
     if options.compile_for:
         print(f"{compile_for(int(options.compile_for.removeprefix('sm_')))} modules are in {KERNELS}")
         return 0
-    OUT.mkdir(parents=True, exist_ok=True)
+    out = options.out
+    out.mkdir(parents=True, exist_ok=True)
     if options.step:
-        run_step(options.step, options)
+        run_step(options.step, options, out)
         return 0
-    (OUT / "results.jsonl").write_text("")
+    (out / "results.jsonl").write_text("")
     end, ended = time.monotonic() + 60.0 * options.minutes, {}
     good = True
     for name in options.only:
@@ -357,8 +364,8 @@ def main() -> int:
         if box < 5.0:
             ended[name] = "no time left"
             continue
-        command = [sys.executable, __file__, "--step", name, "--device", options.device]
-        with (OUT / f"{name}.log").open("w") as log:
+        command = [sys.executable, __file__, "--step", name, "--device", options.device, "--out", str(out)]
+        with (out / f"{name}.log").open("w") as log:
             begin = time.monotonic()
             process = subprocess.Popen(
                 command + ["--quick"] * options.quick, stdout=log, stderr=log, start_new_session=True
@@ -372,9 +379,9 @@ def main() -> int:
                 ended[name] = f"stopped at its time box of {box:.0f} s"
         ended[name] += f" ({time.monotonic() - begin:.0f} s)"
         print(f"{name}: {ended[name]}", flush=True)
-        text, good = summary(ended)
-        (OUT / "summary.md").write_text(text)
-    print(f"{'All passed' if good else 'FAILED'}: {OUT / 'summary.md'}")
+        text, good = summary(ended, out)
+        (out / "summary.md").write_text(text)
+    print(f"{'All passed' if good else 'FAILED'}: {out / 'summary.md'}")
     return int(not good)
 
 

@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -213,3 +216,45 @@ def test_meshes_are_merged_by_material():
         return rows[np.lexsort(rows.T)]
 
     np.testing.assert_array_equal(corners(few), corners(meshes))
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("seed", [6, 9])
+def test_random_scenes_are_read_back_from_their_stages(tmp_path, seed):
+    """The stage of a random scene holds the scene: points to float32, texels to 8 bits of sRGB that are stored."""
+    from random_scenes import random_scene, write_usd
+
+    import warp_ir as ir
+
+    scene = random_scene(seed)
+    write_usd(scene, tmp_path / "scene.usda")
+    read = ir.load_usd(tmp_path / "scene.usda")
+    assert not read.warnings
+    meshes = {mesh.name.split("/")[-1]: mesh for mesh in read.meshes}
+    assert len(meshes) == len(scene.meshes)
+    for mesh in scene.meshes:
+        other = meshes[mesh.name]
+        np.testing.assert_allclose(other.points[other.triangles], mesh.points[mesh.triangles], atol=1e-5)
+        own, found = scene.materials[mesh.material[0]], read.materials[other.material[0]]
+        np.testing.assert_allclose(found.albedo, own.albedo, atol=1e-3)
+    lights = {light.name.split("/")[-1]: light for light in read.lights}
+    for light in scene.lights:
+        assert lights[light.name].kind == light.kind
+        np.testing.assert_allclose(lights[light.name].radiance, light.radiance, rtol=1e-5)
+    np.testing.assert_allclose(read.camera.fit(1, 1).window, scene.camera.fit(1, 1).window, rtol=1e-6)
+
+
+@pytest.mark.extended
+def test_the_gpu_check_runs_without_a_gpu(tmp_path):
+    """A rehearsal on the CPU: every result is a line of JSON, and no ray escapes, nor light."""
+    import warp as wp
+
+    wp.init()
+    script = BENCHMARKS.parent / "scripts" / "gpu_check.py"
+    command = [sys.executable, str(script), "--device", "cpu", "--quick", "--out", str(tmp_path), "--minutes", "60"]
+    environment = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}
+    subprocess.run([*command, "--only", "start", "leaks"], check=True, env=environment)
+    lines = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert {line["step"] for line in lines} == {"start", "leaks"}
+    assert all(line["ok"] for line in lines)
+    assert "## leaks: done" in (tmp_path / "summary.md").read_text()
