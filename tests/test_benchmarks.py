@@ -142,6 +142,20 @@ def test_quick_run_writes_everything(tmp_path):
     assert files["png"].read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.extended
+def test_rays_are_counted(tmp_path):
+    """All types of rays and of evaluations have a speed, and Embree, where it is installed, hits the same triangles."""
+    import rays
+
+    assert rays.main(["--quick", "--width", "32", "--json", str(tmp_path / "rays.json")]) == 0
+    result = json.loads((tmp_path / "rays.json").read_text())
+    assert {row["kind"] for row in result["rays"]} == {"camera", "diffuse", "shadow"}
+    for row in result["rays"]:
+        assert row["ours"] > 0.0 and row["empty"] > 0.0
+        assert row.get("agree", 1.0) > 0.98  # shadow rays end a little before their VPL, by different rules
+    assert min(result["gather"][0][key] for key in ("shadowed", "unshadowed", "empty")) > 0.0
+
+
 def test_the_wrinkled_ball_is_closed():
     """Every edge of the procedural ball that has two ends belongs to two triangles, whatever its size."""
     from scaling import ball
