@@ -28,7 +28,8 @@ def summarize(runs: Iterable[Row]) -> list[Row]:
     rows = []
     for (scene, method, budget), group in groups.items():
         errors = [run["error"] for run in group]
-        row = {"scene": scene, "method": method, "budget": budget, "seeds": len(group), "floor": group[0]["floor"]}
+        row = {"scene": scene, "method": method, "budget": budget, "seeds": len(group)}
+        row |= {"floor": group[0]["floor"], "unit": group[0].get("unit", 1.0)}
         for key in ("seconds", "error", "mean_ratio", "samples", "flip", "pattern"):
             values = [run[key] for run in group if run.get(key) is not None]
             row[key] = statistics.median(values) if values else None
@@ -179,6 +180,8 @@ def breakdown_tables(runs: list[Row]) -> list[Table]:
 def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
     """Time x error divided by that of an earlier result, and whether any has grown by more than `REGRESSION`.
 
+    Times are in the units of the budgets.
+
     Peers are compared as well: if theirs change, the machine has changed and not the code.
     """
     earlier_rows = {(row["scene"], row["method"], row["budget"]): row for row in old}
@@ -187,7 +190,7 @@ def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
         earlier = earlier_rows.get((row["scene"], row["method"], row["budget"]))
         if earlier is None:
             continue
-        seconds = row["seconds"] / earlier["seconds"]
+        seconds = row["seconds"] / earlier["seconds"] * earlier.get("unit", 1.0) / row.get("unit", 1.0)
         error = resolved(row) / resolved(earlier)
         merit = seconds * error
         mark = "WORSE" if merit > REGRESSION else "better" if merit < 1.0 / REGRESSION else ""

@@ -36,11 +36,11 @@ PEER_SAMPLES = 16
 
 
 def measure(
-    task: Task, methods: list[Method], budgets: list[float], seeds: int, *, iterations: bool = False
+    task: Task, methods: list[Method], budgets: list[float], seeds: int, *, unit: float = 1.0, iterations: bool = False
 ) -> list[dict[str, Any]]:
     """Runs all methods in turn, for every seed and budget, and measures time and error.
 
-    Budgets are seconds, or numbers of iterations if `iterations` is set.
+    Budgets are in units of `unit` seconds, or numbers of iterations if `iterations` is set.
     """
     runs = []
     for seed in range(1, seeds + 1):
@@ -50,12 +50,13 @@ def measure(
                     count = round(budget) * (PEER_SAMPLES if method.name.startswith("mitsuba") else 1)
                     run = method.render_samples(count, seed)
                 else:
-                    run = method.render(budget, seed)
+                    run = method.render(budget * unit, seed)
                 runs.append(
                     {
                         "scene": task.name,
                         "method": method.name,
                         "budget": budget,
+                        "unit": unit,
                         "seed": seed,
                         "seconds": run.seconds,
                         "samples": run.samples,
@@ -77,6 +78,7 @@ def measure_all(
     budgets: list[float],
     seeds: int,
     *,
+    unit: float = 1.0,
     iterations: bool = False,
     **reference: Any,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, str]]:
@@ -94,12 +96,13 @@ def measure_all(
         prepared = []
         for method in methods:
             try:
-                setup.append({"scene": name, "method": method.name, **method.prepare(task, budgets)})
+                steps = method.prepare(task, [budget * unit for budget in budgets])
+                setup.append({"scene": name, "method": method.name, **steps})
                 prepared.append(method)
             except NotImplementedError as error:
                 skipped[f"{method.name} on {name}"] = str(error)
         print(f"{name}: {', '.join(method.name for method in prepared)}", file=sys.stderr, flush=True)
-        runs += measure(task, prepared, budgets, seeds, iterations=iterations)
+        runs += measure(task, prepared, budgets, seeds, unit=unit, iterations=iterations)
     return runs, setup, skipped
 
 
@@ -128,7 +131,7 @@ def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    budgets = sorted({row["budget"] for row in rows})
+    budgets = sorted({row["budget"] * row["unit"] for row in rows})
     columns = min(len(scenes), 4)
     lines = -(-len(scenes) // columns)
     figure, panels = plt.subplots(
@@ -204,9 +207,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     for name, value in defaults.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
-    options.unit = None if options.units is None else unit_seconds(options.device)
-    if options.unit is not None:
-        options.seconds = [units * options.unit for units in options.units]
     if unknown := sorted({name for name in options.names if not name.isdecimal()} - set(stored_tasks())):
         parser.error(f"no reference for {', '.join(unknown)}; there are {', '.join(stored_tasks())}")
     known = own_methods(options.device)
@@ -222,12 +222,14 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     peers, missing = find_peers(options.device) if options.peers else ({}, {})
     methods = [*options.own, *peers.values()]
-    budgets = options.iterations or options.seconds
+    budgets = options.iterations or options.units or options.seconds
+    unit = unit_seconds(options.device) if options.units else 1.0
     runs, setup, skipped = measure_all(
         options.names,
         methods,
         budgets,
         options.seeds,
+        unit=unit,
         iterations=options.iterations is not None,
         size=options.size,
         reference_seconds=options.reference_seconds,
@@ -241,8 +243,8 @@ def main(arguments: list[str] | None = None) -> int:
         "environment": environment(options.device),
         "settings": {method.name: method.choices for method in options.own},
         "budgets": budgets,
-        "budgets_are": "iterations" if options.iterations else "seconds",
-        "unit_seconds": options.unit,
+        "budgets_are": "iterations" if options.iterations else "units" if options.units else "seconds",
+        "unit_seconds": unit,
         "seeds": options.seeds,
         "skipped": {**missing, **skipped},
         "rows": rows,

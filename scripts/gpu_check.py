@@ -170,28 +170,27 @@ def tests(options: argparse.Namespace) -> Iterator[Record]:
     import pytest
 
     class Report:
-        passed, failed = 0, []
+        def __init__(self) -> None:
+            self.passed, self.failed = 0, []
 
         def pytest_runtest_logreport(self, report: Any) -> None:
             if report.failed:
                 self.failed.append(report.nodeid)
             self.passed += report.passed and report.when == "call"
 
-    arguments = ["-n", "0", "-q", "--no-header", "--device", options.device, "--rootdir", str(ROOT)]
-    selections = {
-        "gpu": ["-m", "gpu", "tests"],
-        "default": ["-m", "not slow and not gpu and not extended", "tests/physics"],
-        "extended": ["-m", "extended and not slow and not gpu", "tests/physics"],
-    }
     os.chdir(ROOT)
-    for name, selection in selections.items():
-        if options.quick and name == "extended":
-            continue
+    arguments = ["-n", "0", "-q", "--no-header", "--device", options.device, "--rootdir", str(ROOT)]
+    marked = [path for path in sorted(Path("tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
+    physics = sorted(Path("tests/physics").glob("test_*.py"))
+    plain, extended = "not slow and not gpu and not extended", "extended and not slow and not gpu"
+    selections = [("gpu", path) for path in marked if options.device != "cpu"]
+    selections += [(marks, path) for marks in (plain, extended) for path in physics]
+    for marks, path in selections[: 2 if options.quick else None]:
         report = Report()
-        more = ["-k", "furnace"] if options.quick and name == "default" else []
-        code = int(pytest.main([*arguments, *selection, *more], plugins=[report]))
-        ok = code in (0, 5)  # 5: there is none
-        yield {"name": name, "ok": ok, "passed": int(report.passed), "failed": report.failed[:20], "code": code}
+        code = int(pytest.main([*arguments, "-m", marks, str(path)], plugins=[report]))
+        if code != 5:  # there is one
+            result = {"passed": report.passed, "failed": report.failed}
+            yield {"name": f"{path.name}, -m '{marks}'", "ok": code == 0, **result}
 
 
 def speed(options: argparse.Namespace) -> Iterator[Record]:
@@ -207,6 +206,8 @@ def speed(options: argparse.Namespace) -> Iterator[Record]:
     width, height, iterations = (192, 108, 2) if options.quick else (1920, 1080, 60)
 
     def used() -> int:
+        if device.is_cuda and wp.is_mempool_enabled(device):
+            return int(wp.get_mempool_used_mem_current(device))
         if device.is_cuda:
             return int(device.total_memory - device.free_memory)
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
