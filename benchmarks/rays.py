@@ -28,6 +28,7 @@ from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
 from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
+from warp_ir.settings import UNLIMITED
 from warp_ir.surface import closest, visible
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
@@ -215,7 +216,7 @@ def measure(name: str, scene: ir.Scene, device: str, width: int) -> tuple[list[d
         Scratch(launcher),
         light_paths=PATHS,
         absorption="roulette",
-        max_bounces=settings.max_bounces,
+        max_bounces=UNLIMITED,
         scramble=1,
     )
     try:
