@@ -135,10 +135,12 @@ def unassigned_irradiance(
 ) -> UnassignedIrradiance:
     """Mean of the unassigned samples in the 5 x 5 neighbourhood or, without any, of all samples of the pixel.
 
-    Such surfaces are narrow or lie in crevices: few samples of a pixel hit them, and the others are brighter.
+    Such surfaces are narrow or lie in crevices: few samples of a pixel hit them, and the others are brighter. The more
+    the pixel has of its own, the less its neighbours count.
     """
     surfaces = samples.surfaces
     irradiance = WeightedIrradiance()
+    own_count = float(1 + samples.unassigned_count[p])
     for dy in range(-2, 3):
         for dx in range(-2, 3):
             x = p % surfaces.columns + dx
@@ -146,7 +148,7 @@ def unassigned_irradiance(
             if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
                 q = y * surfaces.columns + x
                 distance_squared = float(dx * dx + dy * dy)
-                w = 1.0 / (1.0 + distance_squared * distance_squared)
+                w = 1.0 / (1.0 + own_count * distance_squared * distance_squared)
                 irradiance.direct += w * samples.unassigned_direct[q]
                 irradiance.indirect += w * samples.unassigned_indirect[q]
                 irradiance.weight += w * float(samples.unassigned_count[q])
