@@ -223,3 +223,24 @@ def test_visible_lights_have_alpha(light, tmp_path):
     np.testing.assert_array_equal(ir.Film.load(tmp_path / "f.npz").aov("alpha"), alpha)
     with pytest.raises(ir.InputError, match="one without"):
         film.merge(hidden)
+
+
+def test_change_between_pictures_is_their_noise():
+    """Pictures of 2 and 4 of the same iterations tell the noise of four; tiles without new iterations keep theirs.
+
+    One tile has independent noise of variance 1 per iteration and channel: the sum of 192 squares is known to
+    √(2/192) = 10 % in each of two doublings. Five of those; the larger of two is larger than the mean.
+    """
+    from warp_ir.film.picture_noise import PictureNoise
+
+    samples = 100.0 + np.random.default_rng(0).normal(size=(4, 8, 8, 3))
+    pictures = {n: samples[:n].mean(axis=0).astype(np.float32) for n in (1, 2, 4)}
+    noise = PictureNoise.first(pictures[1], np.array([1], np.int32))
+    for n in (2, 4):
+        noise = noise.updated(pictures[n], np.array([n], np.int32))
+    relative = 192 / (4 * 100.0**2 * 1.01)  # of four iterations; L² + ε is 1.01 L²
+    error = noise.squared_errors(np.array([4], np.int32))
+    np.testing.assert_allclose(error, 2.0 * relative, rtol=0.5)  # twice: the allowance for bias
+    kept = noise.updated(pictures[4], np.array([4], np.int32))
+    np.testing.assert_array_equal(kept.variance, noise.variance)
+    assert np.isnan(PictureNoise.first(pictures[1], np.array([1], np.int32)).squared_errors(np.array([1]))).all()

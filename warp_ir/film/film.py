@@ -18,7 +18,8 @@ from warp_ir.device_scene import DeviceFrame
 from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, new_film_data
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
-from warp_ir.film.storage import FilmState, read_arrays, read_state, reconstruction_names, write_film
+from warp_ir.film.picture_noise import PictureNoise, tile_sums
+from warp_ir.film.storage import FilmState, read_arrays, read_noise, read_state, reconstruction_names, write_film
 from warp_ir.gbuffer import GBuffer
 from warp_ir.image.io import write_image
 from warp_ir.scene import InputError
@@ -121,6 +122,7 @@ class Film:
         """Whether anything in the scene emits: then no surface need be black."""
         self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them
         self._denoised: tuple[int, Image] | None = None
+        self._noise: PictureNoise | None = None
         self._frame = frame or DeviceFrame(np.zeros(3), 1.0)
         self._launcher = launcher
         self._data = new_film_data(width * height, has_emission, sees_lights, launcher)
@@ -186,6 +188,7 @@ class Film:
             array.assign(mine)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
+        self._noise = None  # it is of one sequence of iterations
         self.iterations += other.iterations
         self._skipped += other._skipped
         self.choose(self.chosen)
@@ -260,8 +263,9 @@ class Film:
         """Estimated relative RMS error of the picture: √ of the mean of (se² + b²) / (L² + 0.01 m²).
 
         se and b are those of `standard_error`, m is the mean of the radiance L. With a filter the picture is made for
-        it, unless it has been made. Where L is uncertain, the denominator moves towards the smaller median of its
-        neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
+        it, unless it has been made. Where `measure_noise` has seen three pictures, se is the noise that the filter
+        leaves, with an allowance for its bias. Where L is uncertain, the denominator moves towards the smaller median
+        of its neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
 
         1 if the scene emits and none of that light has reached a surface in view: what the samples have missed is
         unknown. NaN with fewer than two iterations.
@@ -289,7 +293,41 @@ class Film:
         if filtered and self.reconstruction is not None and self.iterations > 1:
             difference = self._filter_difference(self.reconstruction)
         _, error, noise, change = self._tile_errors(difference).T
-        return np.asarray((error + np.maximum(change - noise, 0.0)) / (3 * self.width * self.height))
+        error, bias = (x / (3 * self.width * self.height) for x in (error, np.maximum(change - noise, 0.0)))
+        return np.asarray(self.filtered_errors(error) + bias if filtered else error)
+
+    def measure_noise(self) -> None:
+        """Makes the filtered picture, and compares it with the last one for which this was called.
+
+        To be called at powers of two of the iterations. From the third picture on, `error` tells what the filter gains.
+        """
+        if self.reconstruction is None:
+            return
+        picture = np.asarray(self._reconstruct(self.reconstruction)[:2].sum(axis=0))
+        iterations = self.tile_iterations
+        self._noise = (
+            PictureNoise.first(picture, iterations) if self._noise is None else self._noise.updated(picture, iterations)
+        )
+
+    def filtered_errors(self, plain: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """`squared_errors` of the filtered picture as far as it is known without making it, from those of the mean.
+
+        The mean's are taken if they are smaller, and where emission is in view: the first camera rays on an edge are
+        those of the last picture, so that its error changes little.
+        """
+        if self._noise is None:
+            return plain
+        errors = self._noise.squared_errors(self.tile_iterations) / (3 * self.width * self.height)
+        emissive = tile_sums(self._near_emission()[..., None].astype(np.float64)) > 0.0
+        errors = np.where(emissive, plain, errors)
+        return errors if errors.sum() < plain.sum() else plain  # NaN: not known yet
+
+    def _near_emission(self) -> npt.NDArray[np.bool_]:
+        """Pixels [height, width] that see emission, and their neighbours."""
+        emissive = np.pad(self._radiance_of("emission").max(axis=-1) > 0.0, 1)
+        for axis in (0, 1):
+            emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
+        return np.asarray(emissive[1:-1, 1:-1])
 
     def _tile_errors(self, filter_difference: Image | None) -> npt.NDArray[np.float64]:
         """Sums of `tile_errors` over every tile, relative to L² + 0.01 m²."""
@@ -303,10 +341,7 @@ class Film:
         There the picture is made of more camera rays than the mean, so that the difference is no bias.
         """
         difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*_RADIANCE))
-        emissive = np.pad(self._radiance_of("emission").max(axis=-1) > 0.0, 1)
-        for axis in (0, 1):
-            emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
-        return np.where(emissive[1:-1, 1:-1, None], np.float32(0.0), difference)
+        return np.where(self._near_emission()[..., None], np.float32(0.0), difference)
 
     @_exclusive
     def aov(self, name: str) -> npt.NDArray[Any]:
@@ -380,7 +415,7 @@ class Film:
             key: Identifies the scene and the settings; `resume` compares it.
         """
         state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame)
-        write_film(path, state, self._saved_arrays())
+        write_film(path, state, self._saved_arrays(), self._noise)
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
         """Restores a film that `save` wrote into this one, which must be empty and of the same scene.
@@ -396,6 +431,7 @@ class Film:
         if any(stored[name].shape[0] != array.shape[0] for name, array in arrays.items()):
             raise InputError(f"{os.fspath(path)}: not a film: its arrays differ in size")
         self._restore(state, arrays, stored)
+        self._noise = read_noise(path)
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
