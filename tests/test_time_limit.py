@@ -28,6 +28,9 @@ class SimulatedFilm:
     def squared_errors(self):
         return self.tile_seconds / self.tile_iterations
 
+    def filtered_errors(self, plain):
+        return plain
+
     def is_unlit(self):
         return False
 
