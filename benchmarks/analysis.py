@@ -28,25 +28,27 @@ def summarize(runs: Iterable[Row]) -> list[Row]:
     rows = []
     for (scene, method, budget), group in groups.items():
         errors = [run["error"] for run in group]
-        row = {"scene": scene, "method": method, "budget": budget, "seeds": len(group), "floor": group[0]["floor"]}
-        for key in ("seconds", "error", "mean_ratio", "samples"):
-            row[key] = statistics.median(run[key] for run in group)
+        row = {"scene": scene, "method": method, "budget": budget, "seeds": len(group)}
+        row |= {"floor": group[0]["floor"], "unit": group[0].get("unit", 1.0)}
+        for key in ("seconds", "error", "mean_ratio", "samples", "flip", "pattern"):
+            values = [run[key] for run in group if run.get(key) is not None]
+            row[key] = statistics.median(values) if values else None
         rows.append({**row, "error_low": min(errors), "error_high": max(errors)})
     return rows
 
 
 def resolved(row: Row, key: str = "error") -> float:
     """The error, at least the resolution of the reference: ratios of such errors are meaningful."""
-    return max(row[key], RESOLUTION * row["floor"], 1e-12)
+    return max(row[key], 1e-12 if key == "flip" else RESOLUTION * row["floor"], 1e-12)
 
 
-def error_at(curve: list[Row], seconds: float) -> float | None:
+def error_at(curve: list[Row], seconds: float, key: str = "error") -> float | None:
     """The error of a method after `seconds`, interpolated in its measured curve; None long before its first picture.
 
     The interpolation is linear in the logarithms. Beyond the ends the nearest segment is extrapolated, with an exponent
     between that of 1/time and 0.
     """
-    points = sorted((math.log(row["seconds"]), math.log(resolved(row))) for row in curve)
+    points = sorted((math.log(row["seconds"]), math.log(resolved(row, key))) for row in curve)
     x = math.log(seconds)
     if x < points[0][0] - math.log(2.0):
         return None
@@ -61,11 +63,13 @@ def error_at(curve: list[Row], seconds: float) -> float | None:
     return math.exp(end[1] + min(max(slope, -1.0), 0.0) * (x - end[0]))
 
 
-def advantage(row: Row, rows: list[Row], peer: str) -> float | None:
-    """The peer's error divided by ours at equal time; None if the peer has no picture by then."""
+def advantage(row: Row, rows: list[Row], peer: str, key: str = "error") -> float | None:
+    """The peer's error (or FLIP) divided by ours at equal time; None if the peer has no picture by then."""
     curve = [other for other in rows if other["scene"] == row["scene"] and other["method"] == peer]
-    error = error_at(curve, row["seconds"]) if curve else None
-    return None if error is None else error / resolved(row)
+    if row[key] is None or any(other[key] is None for other in curve):
+        return None
+    error = error_at(curve, row["seconds"], key) if curve else None
+    return None if error is None else error / resolved(row, key)
 
 
 def error_tables(rows: list[Row], peers: list[str]) -> list[Table]:
@@ -85,13 +89,40 @@ def error_tables(rows: list[Row], peers: list[str]) -> list[Table]:
                     number(row["error"]),
                     f"{number(row['error_low'], 2)} … {number(row['error_high'], 2)}",
                     f"{100.0 * row['mean_ratio']:+.2f} %",
+                    number(row["flip"]),
+                    number(row["pattern"]),
                     *(number(ratio) for ratio in ratios),
                 )
             )
-        columns = ("method", "budget s", "seconds", "samples", "relMSE", "spread", "mean", *(f"× {p}" for p in peers))
+        columns = ("method", "budget", "seconds", "samples", "relMSE", "spread", "mean", "FLIP", "pattern")
+        columns += tuple(f"× {peer}" for peer in peers)
         note = f"The reference's own relMSE, which is subtracted: {number(chosen[0]['floor'], 2)}."
         tables.append(Table(f"{scene}: error against time", columns, lines, note))
     return tables
+
+
+def overview_table(rows: list[Row], peers: list[str]) -> Table | None:
+    """One row for each scene: relMSE and FLIP of the best peer divided by those of our best method, at equal time."""
+    lines, ratios = [], []
+    budgets = sorted({row["budget"] for row in rows})
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        cells: list[float | None] = []
+        for budget in budgets:
+            own = [r for r in rows if (r["scene"], r["budget"]) == (scene, budget) and r["method"] not in peers]
+            for key in ("error", "flip"):
+                by_method = [[advantage(row, rows, peer, key) for peer in peers] for row in own]
+                least = [min(found) for each in by_method if (found := [x for x in each if x is not None])]
+                cells.append(max(least, default=None))
+        ratios.append(cells)
+        lines.append((scene, *(number(cell) for cell in cells)))
+    if not peers:
+        return None
+    for name, measure in (("median", statistics.median), ("worst", min)):
+        columns = [[cell for cell in column if cell is not None] for column in zip(*ratios, strict=True)]
+        lines.append((name, *(number(measure(column)) if column else "–" for column in columns)))
+    header = [f"{key}, {number(budget)}" for budget in budgets for key in ("relMSE", "FLIP")]
+    title = "The best peer divided by our best method, at equal time"
+    return Table(title, ("scene", *header), lines, "Columns are named by the budget of our method.")
 
 
 def target_table(rows: list[Row], peers: list[str]) -> Table | None:
@@ -149,6 +180,8 @@ def breakdown_tables(runs: list[Row]) -> list[Table]:
 def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
     """Time x error divided by that of an earlier result, and whether any has grown by more than `REGRESSION`.
 
+    Times are in the units of the budgets.
+
     Peers are compared as well: if theirs change, the machine has changed and not the code.
     """
     earlier_rows = {(row["scene"], row["method"], row["budget"]): row for row in old}
@@ -157,12 +190,12 @@ def compare(new: list[Row], old: list[Row]) -> tuple[Table, bool]:
         earlier = earlier_rows.get((row["scene"], row["method"], row["budget"]))
         if earlier is None:
             continue
-        seconds = row["seconds"] / earlier["seconds"]
+        seconds = row["seconds"] / earlier["seconds"] * earlier.get("unit", 1.0) / row.get("unit", 1.0)
         error = resolved(row) / resolved(earlier)
         merit = seconds * error
         mark = "WORSE" if merit > REGRESSION else "better" if merit < 1.0 / REGRESSION else ""
         worse |= merit > REGRESSION
         cells = (number(row["budget"]), number(seconds), number(error), number(merit), mark)
         lines.append((row["scene"], row["method"], *cells))
-    columns = ("scene", "method", "budget s", "time ratio", "error ratio", "time x error", "")
+    columns = ("scene", "method", "budget", "time ratio", "error ratio", "time x error", "")
     return Table("Comparison with the earlier result", columns, lines), worse

@@ -2,8 +2,8 @@
 
     python benchmarks/make_references.py [NAME ...] [--seconds S] [--variant llvm_ad_rgb] [--png FOLDER]
 
-Each `Scene` is translated to Mitsuba and rendered in independent passes until its error target or its time limit is
-reached. The .npz file of a picture holds `mean` and `standard_error` (float32 [height, width, 3], linear radiance),
+Each `Scene` is translated to Mitsuba and rendered in independent passes until its error target or its limit of CPU time
+is reached. The .npz file of a picture holds `mean` and `standard_error` (float32 [height, width, 3], linear radiance),
 `floor` (relMSE of the mean, from the standard error) and its provenance as strings.
 
 The variant `llvm_ad_rgb` needs LLVM 16 or newer (Debian: libllvm19), which is found automatically or at
@@ -25,11 +25,12 @@ The two renderers differ, and the translation compensates for it:
 
 import argparse
 import ctypes.util
+import dataclasses
 import hashlib
 import os
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import warp_ir as ir
-from warp_ir.scene import Camera, Floats, Light, LightKind, Mesh, Projection, Scene, Texture, Wrap
+from warp_ir.scene import Bools, Camera, Floats, Light, LightKind, Mesh, Projection, Scene, Texture, Wrap
 
 if TYPE_CHECKING:
     import mitsuba
@@ -97,8 +98,7 @@ def _bitmap(mi: ModuleType, texture: Texture) -> Description:
 
 
 def _mesh(mi: ModuleType, mesh: Mesh, scene: Scene, index: int) -> "mitsuba.Mesh":
-    """The triangles of `mesh` that have material `index`, as a Mitsuba mesh with three vertices per triangle."""
-    chosen = mesh.material == index
+    """A mesh of material `index`, as a Mitsuba mesh with three vertices per triangle."""
     material = scene.materials[index]
     emissive = any(value > 0.0 for value in material.emission)
     if emissive and mesh.double_sided:
@@ -118,7 +118,7 @@ def _mesh(mi: ModuleType, mesh: Mesh, scene: Scene, index: int) -> "mitsuba.Mesh
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(material.emission)})
     properties["face_normals"] = not smooth
 
-    triangles = mesh.triangles[chosen]
+    triangles = mesh.triangles
     result = mi.Mesh(
         mesh.name,
         triangles.size,
@@ -128,14 +128,14 @@ def _mesh(mi: ModuleType, mesh: Mesh, scene: Scene, index: int) -> "mitsuba.Mesh
         props=properties,
     )
     if coloured:
-        result.add_attribute("vertex_color", 3, mesh.colors[chosen].ravel().astype(np.float32))
+        result.add_attribute("vertex_color", 3, mesh.colors.ravel().astype(np.float32))
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = mesh.points[triangles].ravel().astype(np.float32)
     parameters["faces"] = np.arange(triangles.size, dtype=np.uint32)
     if smooth:
-        parameters["vertex_normals"] = mesh.normals[chosen].ravel().astype(np.float32)
+        parameters["vertex_normals"] = mesh.normals.ravel().astype(np.float32)
     if texture is not None:
-        uvs = mesh.uvs[texture.uv][chosen] @ texture.transform[:, :2].T + texture.transform[:, 2]
+        uvs = mesh.uvs[texture.uv] @ texture.transform[:, :2].T + texture.transform[:, 2]
         # Mitsuba's v runs down the image.
         parameters["vertex_texcoords"] = (uvs * [1, -1] + [0, 1]).ravel().astype(np.float32)
     parameters.update()
@@ -200,6 +200,32 @@ def _sensor(mi: ModuleType, camera: Camera, extent: float, width: int, height: i
     }
 
 
+def merged(meshes: Iterable[Mesh]) -> list[Mesh]:
+    """One mesh for each material and set of attributes: every shape costs Mitsuba a fixed time per render."""
+    groups: dict[tuple[object, ...], list[tuple[Mesh, Bools]]] = {}
+    for mesh in meshes:
+        for index in np.unique(mesh.material):
+            smooth, coloured = mesh.normals is not None, mesh.colors is not None
+            key = (int(index), smooth, coloured, mesh.double_sided, tuple(sorted(mesh.uvs)))
+            groups.setdefault(key, []).append((mesh, mesh.material == index))
+    result = []
+    for (_, smooth, coloured, double_sided, names), parts in groups.items():
+        starts = np.cumsum([0, *(len(mesh.points) for mesh, _ in parts[:-1])])
+        result.append(
+            Mesh(
+                parts[0][0].name,
+                np.concatenate([mesh.points for mesh, _ in parts]),
+                np.concatenate([mesh.triangles[chosen] + k for (mesh, chosen), k in zip(parts, starts, strict=True)]),
+                np.concatenate([mesh.material[chosen] for mesh, chosen in parts]),
+                np.concatenate([mesh.normals[chosen] for mesh, chosen in parts]) if smooth else None,
+                np.concatenate([mesh.colors[chosen] for mesh, chosen in parts]) if coloured else None,
+                bool(double_sided),
+                {name: np.concatenate([mesh.uvs[name][chosen] for mesh, chosen in parts]) for name in names},
+            )
+        )
+    return result
+
+
 def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = None) -> "mitsuba.Scene":
     """Translates a scene to Mitsuba, ready for `mitsuba.render`.
 
@@ -224,9 +250,8 @@ def to_mitsuba(scene: Scene, width: int, height: int, max_bounces: int | None = 
         "integrator": {"type": "volpath", "max_depth": depth, "rr_depth": 6, "hide_emitters": not emissive},
         "sensor": _sensor(mi, scene.camera, scene.extent, width, height),
     }
-    for k, mesh in enumerate(scene.flat().meshes):
-        for index in np.unique(mesh.material):
-            result[f"mesh_{k}_{index}"] = _mesh(mi, mesh, scene, int(index))
+    for k, mesh in enumerate(merged(scene.flat().meshes)):
+        result[f"mesh_{k}"] = _mesh(mi, mesh, scene, int(mesh.material[0]))
     for k, light in enumerate(scene.lights):
         result[f"light_{k}"] = _light(mi, light, (lower + upper) / 2, scene.extent)
     return mi.load_dict(result)
@@ -237,11 +262,21 @@ def render_reference(
 ) -> dict[str, Any]:
     """Renders passes of independent seeds until `TARGET_FLOOR` or `seconds` is reached; returns what is stored."""
     translated = to_mitsuba(scene, width, height, max_bounces)
-    spp = max(4, 2**18 // (width * height) * 4)  # about a million paths a pass
+    spp = max(4, 2**18 // (width * height))  # about 260 000 paths a pass
+
+    def render_pass(seed: int) -> Floats:
+        return np.array(mi.render(translated, spp=spp, seed=seed), dtype=np.float64) * scene.camera.exposure
+
+    result = mean_of_passes(render_pass, seconds)
+    return {**result, "spp": spp * result["passes"]}
+
+
+def mean_of_passes(render_pass: Callable[[int], Floats], seconds: float) -> dict[str, Any]:
+    """The mean of pictures of the seeds 0, 1, ..., until `TARGET_FLOOR` or `seconds` of CPU time: what is stored."""
     passes, mean, squares = 0, 0.0, 0.0
-    start = time.perf_counter()
+    start = time.process_time()
     while True:
-        picture = np.array(mi.render(translated, spp=spp, seed=passes), dtype=np.float64) * scene.camera.exposure
+        picture = render_pass(passes)
         passes += 1
         delta = picture - mean
         mean = mean + delta / passes
@@ -249,15 +284,64 @@ def render_reference(
         if passes >= 8:
             standard_error = np.sqrt(squares / (passes - 1) / passes)
             floor = relative_mse_floor(mean, standard_error)
-            if floor <= TARGET_FLOOR or time.perf_counter() - start > seconds:
+            if floor <= TARGET_FLOOR or time.process_time() - start > seconds:
                 break
     return {
         "mean": mean.astype(np.float32),
         "standard_error": standard_error.astype(np.float32),
         "floor": floor,
-        "spp": spp * passes,
         "passes": passes,
     }
+
+
+def cached_reference(scene: Scene, width: int, height: int, seconds: float) -> dict[str, Any]:
+    """The reference of a scene that has none stored: from `cache/`, or rendered now in `seconds` and put there.
+
+    Mitsuba renders it, or where that is missing our own estimator `path`, which the tests hold against Mitsuba.
+    """
+    path = REFERENCES.parent / "cache" / f"{scene.name}_{width}x{height}_{content_digest(scene)[:12]}.npz"
+    if not path.exists():
+        try:
+            mi = use_mitsuba()
+        except ImportError:
+            program, spp = f"warp_ir {ir.__version__}, path", 64
+            settings = ir.RenderSettings(width=width, height=height, estimator="path", iterations=spp)
+            result = mean_of_passes(
+                lambda seed: ir.render(scene, dataclasses.replace(settings, seed=seed)).radiance().astype(np.float64),
+                seconds,
+            )
+        else:
+            program = f"Mitsuba {mi.__version__} volpath, {mi.variant()}"
+            result = render_reference(mi, scene, width, height, None, seconds)
+        path.parent.mkdir(exist_ok=True)
+        np.savez_compressed(path, **result, program=program)
+        print(f"{scene.name}: reference by {program}, floor {result['floor']:.1e}", file=sys.stderr, flush=True)
+    with np.load(path) as stored:
+        return {"mean": stored["mean"], "standard_error": stored["standard_error"], "floor": float(stored["floor"])}
+
+
+def content_digest(value: object) -> str:
+    """SHA-256 of a scene's content: its records, their numbers and arrays."""
+    hasher = hashlib.sha256()
+
+    def add(item: object) -> None:
+        if isinstance(item, np.ndarray):
+            hasher.update(f"{item.dtype}{item.shape}".encode() + item.tobytes())
+        elif dataclasses.is_dataclass(item):
+            for part in dataclasses.fields(item):
+                hasher.update(part.name.encode())
+                add(getattr(item, part.name))
+        elif isinstance(item, tuple | list):
+            for part in item:
+                add(part)
+        elif isinstance(item, Mapping):
+            for key in sorted(item):
+                add((key, item[key]))
+        else:
+            hasher.update(repr(item).encode())
+
+    add(value)
+    return hasher.hexdigest()
 
 
 def digest(stage: Path) -> str:
@@ -270,7 +354,7 @@ def main() -> None:
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help=f"pictures to render: {', '.join(PICTURES)} (default: all)"
     )
-    parser.add_argument("--seconds", type=float, default=300.0, help="time limit for each picture (default: 300)")
+    parser.add_argument("--seconds", type=float, default=600.0, help="CPU time for each picture (default: 600)")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (default: llvm_ad_rgb)")
     parser.add_argument("--png", type=Path, metavar="FOLDER", help="also write tone-mapped pictures to this folder")
     arguments = parser.parse_args()

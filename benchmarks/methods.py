@@ -3,8 +3,9 @@
 Our methods and the peers in `peers/` have the same interface, `Method`:
 
     name                            name in tables and for --estimators
-    prepare(task, budgets) -> dict  compiles and uploads everything; returns seconds by step
-    render(seconds, seed) -> Run    renders a picture in about that time and measures the time taken
+    prepare(task, budgets) -> dict      compiles and uploads everything; returns seconds by step
+    render(seconds, seed) -> Run        renders a picture in about that time and measures the time taken
+    render_samples(count, seed) -> Run  renders with that many iterations or samples per pixel; measures CPU time
 """
 
 import dataclasses
@@ -16,9 +17,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from make_references import PICTURES, REFERENCES, ROOT, digest
+from make_references import PICTURES, REFERENCES, ROOT, cached_reference, digest
+from random_scenes import random_scene
 
 import warp_ir as ir
+from warp_ir.renderer import Renderer
 from warp_ir.settings import ESTIMATOR_NAMES
 
 SETUP = ("compile", "upload")
@@ -59,7 +62,7 @@ class Run:
     picture: Pixels
     """Linear radiance, [height, width, 3]."""
     seconds: float
-    """Wall time of the render, up to the picture in host memory, without compilation and upload."""
+    """Wall time of the render (of `render_samples` CPU time), up to the picture in host memory, without setup."""
     samples: int
     """Iterations, or samples per pixel."""
     timings: dict[str, float] = field(default_factory=dict)
@@ -77,6 +80,8 @@ class Method(Protocol):
 
     def render(self, seconds: float, seed: int) -> Run: ...
 
+    def render_samples(self, count: int, seed: int) -> Run: ...
+
 
 class StaleReference(Exception):
     """The scene has changed since its reference was rendered: errors cannot be measured."""
@@ -87,12 +92,21 @@ def stored_tasks() -> list[str]:
     return [name for name in PICTURES if (REFERENCES / f"{name}.npz").exists()]
 
 
-def load_task(name: str) -> Task:
-    """The scene and the reference of a stored picture.
+def load_task(name: str, *, size: int = 96, reference_seconds: float = 240.0) -> Task:
+    """The scene and the reference of a stored picture, or of a seed (a number) of `random_scenes`.
+
+    Args:
+        name: Name of the picture, or the number.
+        size: Width and height of a picture of a random scene.
+        reference_seconds: CPU time for a reference that is not in the cache.
 
     Raises:
         StaleReference: The scene has changed since its reference was rendered.
     """
+    if name.isdecimal():
+        scene = random_scene(int(name))
+        made = cached_reference(scene, size, size, reference_seconds)
+        return Task(scene.name, scene, made["mean"], made["standard_error"], made["floor"])
     stem, _, _, max_bounces = PICTURES[name]
     stage: Path = ROOT / "scenes_usd" / f"{stem}.usda"
     with np.load(REFERENCES / f"{name}.npz") as stored:
@@ -122,9 +136,19 @@ class Ours:
         start = time.perf_counter()
         film = ir.render(self._scene, settings, device=self.device)
         picture = film.radiance()
-        duration = time.perf_counter() - start - sum(film.timings.get(step, 0.0) for step in SETUP)
+        return self._run(film, picture, time.perf_counter() - start - sum(film.timings.get(s, 0.0) for s in SETUP))
+
+    def render_samples(self, count: int, seed: int) -> Run:
+        settings = dataclasses.replace(self._settings, iterations=count, seed=seed)
+        renderer = Renderer(self._scene, settings, device=self.device)
+        start = time.process_time()
+        film = renderer.render()
+        picture = film.radiance()
+        return self._run(film, picture, time.process_time() - start)
+
+    def _run(self, film: ir.Film, picture: Pixels, seconds: float) -> Run:
         phases = {name: t for name, t in film.timings.items() if name not in SETUP}
-        return Run(picture, duration, film.iterations, phases, film.counts)
+        return Run(picture, seconds, film.iterations, phases, film.counts)
 
 
 def own_methods(device: str) -> dict[str, Ours]:

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("warp-ir", "warp-lang", "numpy", "mitsuba", "drjit", "pyoidn", "embreex")
+PACKAGES = ("warp-ir", "warp-lang", "numpy", "mitsuba", "drjit", "pyoidn", "embreex", "flip-evaluator")
 
 
 @dataclass(frozen=True)

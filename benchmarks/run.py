@@ -2,9 +2,13 @@
 
     python benchmarks/run.py [-k NAME ...] [--device cpu] [--seconds 0.2 0.6 2] [--seeds 3] [--estimators NAME ...]
                              [--peers] [--json FILE] [--plot FILE.png] [--compare OLD.json] [--quick]
+    python benchmarks/run.py -k 0 1 2 ... --units 0.2 0.6 2 --peers    # scenes that are made from these numbers
+    python benchmarks/run.py -k 0 1 2 ... --iterations 1 2 4 8         # fixed iterations and CPU time
 
 Methods take turns within one run, on the same cores. Compilation and upload happen before and are reported
-separately. Every number is the median over seeds.
+separately. Every number is the median over seeds. Budgets are seconds, or units of a work that is measured first
+(`work_unit.py`), so that slow machines and fast ones ask the same; or iterations, with the CPU time that they take,
+which other load on the machine disturbs least.
 """
 
 import argparse
@@ -15,33 +19,51 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
-from analysis import breakdown_tables, compare, error_tables, resolved, summarize, target_table
+from analysis import breakdown_tables, compare, error_tables, overview_table, resolved, summarize, target_table
 from methods import Method, StaleReference, Task, load_task, own_methods, stored_tasks
 from peers import find_peers
+from perception import flip, pattern_peak
 from report import Table, environment, number, publish
+from work_unit import unit_seconds
 
 from warp_ir.metrics import mean_ratio, relative_mse
 
 QUICK: dict[str, Any] = {"names": ["cornell_box", "furnace_cube"], "seconds": [0.1], "seeds": 1}
 
 
-def measure(task: Task, methods: list[Method], budgets: list[float], seeds: int) -> list[dict[str, Any]]:
-    """Runs all methods in turn, for every seed and budget, and measures time and error."""
+PEER_SAMPLES = 16
+"""Samples per pixel of a peer for an iteration of ours, where iterations are fixed: they take a similar time."""
+
+
+def measure(
+    task: Task, methods: list[Method], budgets: list[float], seeds: int, *, unit: float = 1.0, iterations: bool = False
+) -> list[dict[str, Any]]:
+    """Runs all methods in turn, for every seed and budget, and measures time and error.
+
+    Budgets are in units of `unit` seconds, or numbers of iterations if `iterations` is set.
+    """
     runs = []
     for seed in range(1, seeds + 1):
         for budget in budgets:
             for method in methods:
-                run = method.render(budget, seed)
+                if iterations:
+                    count = round(budget) * (PEER_SAMPLES if method.name.startswith("mitsuba") else 1)
+                    run = method.render_samples(count, seed)
+                else:
+                    run = method.render(budget * unit, seed)
                 runs.append(
                     {
                         "scene": task.name,
                         "method": method.name,
                         "budget": budget,
+                        "unit": unit,
                         "seed": seed,
                         "seconds": run.seconds,
                         "samples": run.samples,
                         "error": relative_mse(run.picture, task.reference, reference_error=task.reference_error),
                         "mean_ratio": mean_ratio(run.picture, task.reference),
+                        "flip": flip(run.picture, task.reference),
+                        "pattern": pattern_peak(run.picture, task.reference),
                         "floor": task.floor,
                         "timings": run.timings,
                         "counts": run.counts,
@@ -51,25 +73,36 @@ def measure(task: Task, methods: list[Method], budgets: list[float], seeds: int)
 
 
 def measure_all(
-    names: list[str], methods: list[Method], budgets: list[float], seeds: int
+    names: list[str],
+    methods: list[Method],
+    budgets: list[float],
+    seeds: int,
+    *,
+    unit: float = 1.0,
+    iterations: bool = False,
+    **reference: Any,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, str]]:
-    """The runs of all scenes, the seconds of their preparation, and what was skipped with the reason."""
+    """The runs of all scenes, the seconds of their preparation, and what was skipped with the reason.
+
+    `reference` says how references of random scenes are made, as in `load_task`.
+    """
     runs, setup, skipped = [], [], {}
     for name in names:
         try:
-            task = load_task(name)
+            task = load_task(name, **reference)
         except StaleReference as error:
             skipped[name] = str(error)
             continue
         prepared = []
         for method in methods:
             try:
-                setup.append({"scene": name, "method": method.name, **method.prepare(task, budgets)})
+                steps = method.prepare(task, [budget * unit for budget in budgets])
+                setup.append({"scene": name, "method": method.name, **steps})
                 prepared.append(method)
             except NotImplementedError as error:
                 skipped[f"{method.name} on {name}"] = str(error)
         print(f"{name}: {', '.join(method.name for method in prepared)}", file=sys.stderr, flush=True)
-        runs += measure(task, prepared, budgets, seeds)
+        runs += measure(task, prepared, budgets, seeds, unit=unit, iterations=iterations)
     return runs, setup, skipped
 
 
@@ -98,7 +131,7 @@ def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    budgets = sorted({row["budget"] for row in rows})
+    budgets = sorted({row["budget"] * row["unit"] for row in rows})
     columns = min(len(scenes), 4)
     lines = -(-len(scenes) // columns)
     figure, panels = plt.subplots(
@@ -135,10 +168,26 @@ def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parses the command line, checks its names and fills in the defaults."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("-k", dest="names", nargs="+", metavar="NAME", help="scenes (default: all with a reference)")
+    parser.add_argument(
+        "-k",
+        dest="names",
+        nargs="+",
+        metavar="NAME",
+        help="scenes with a stored reference, or numbers of random scenes (default: all with a reference)",
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda:N")
-    parser.add_argument("--seconds", type=float, nargs="+", help="time budgets (default: 0.2 0.6 2)")
+    budgets = parser.add_mutually_exclusive_group()
+    budgets.add_argument("--seconds", type=float, nargs="+", help="time budgets (default: 0.2 0.6 2)")
+    budgets.add_argument("--units", type=float, nargs="+", help="time budgets in units of a measured work")
+    budgets.add_argument("--iterations", type=int, nargs="+", help="numbers of iterations; CPU time is measured")
     parser.add_argument("--seeds", type=int, help="number of seeds (default: 3)")
+    parser.add_argument("--size", type=int, default=96, help="width of the pictures of random scenes (default: 96)")
+    parser.add_argument(
+        "--reference-seconds",
+        type=float,
+        default=240.0,
+        help="CPU time for the reference of a random scene that is not in benchmarks/cache yet (default: 240)",
+    )
     parser.add_argument("--estimators", nargs="+", metavar="NAME", help="our methods to run (default: all)")
     parser.add_argument("--peers", action="store_true", help="also measure other renderers that are installed")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers")
@@ -158,7 +207,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     for name, value in defaults.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
-    if unknown := sorted(set(options.names) - set(stored_tasks())):
+    if unknown := sorted({name for name in options.names if not name.isdecimal()} - set(stored_tasks())):
         parser.error(f"no reference for {', '.join(unknown)}; there are {', '.join(stored_tasks())}")
     known = own_methods(options.device)
     if unknown := sorted(set(options.estimators or known) - set(known)):
@@ -173,7 +222,18 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     peers, missing = find_peers(options.device) if options.peers else ({}, {})
     methods = [*options.own, *peers.values()]
-    runs, setup, skipped = measure_all(options.names, methods, options.seconds, options.seeds)
+    budgets = options.iterations or options.units or options.seconds
+    unit = unit_seconds(options.device) if options.units else 1.0
+    runs, setup, skipped = measure_all(
+        options.names,
+        methods,
+        budgets,
+        options.seeds,
+        unit=unit,
+        iterations=options.iterations is not None,
+        size=options.size,
+        reference_seconds=options.reference_seconds,
+    )
     for name, reason in {**missing, **skipped}.items():
         print(f"skipped {name}: {reason}", file=sys.stderr)
     if not runs:
@@ -182,7 +242,9 @@ def main(arguments: list[str] | None = None) -> int:
     results = {
         "environment": environment(options.device),
         "settings": {method.name: method.choices for method in options.own},
-        "seconds": options.seconds,
+        "budgets": budgets,
+        "budgets_are": "iterations" if options.iterations else "units" if options.units else "seconds",
+        "unit_seconds": unit,
         "seeds": options.seeds,
         "skipped": {**missing, **skipped},
         "rows": rows,
@@ -191,6 +253,7 @@ def main(arguments: list[str] | None = None) -> int:
     }
     tables = [
         *error_tables(rows, list(peers)),
+        overview_table(rows, list(peers)),
         target_table(rows, list(peers)),
         *breakdown_tables(runs),
         setup_table(setup),
@@ -198,7 +261,8 @@ def main(arguments: list[str] | None = None) -> int:
     worse = False
     if options.compare is not None:
         old = json.loads(options.compare.read_text())
-        table, worse = compare(rows, old.get("error", old)["rows"])
+        old_rows = [row for part in (old, old.get("error", {}), old.get("random", {})) for row in part.get("rows", [])]
+        table, worse = compare(rows, old_rows)
         tables.append(table)
     present = [table for table in tables if table is not None]
     publish(present, results, json_path=options.json, markdown_path=options.markdown)

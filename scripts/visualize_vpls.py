@@ -1,8 +1,10 @@
-"""Draws the virtual point lights of a USD stage, one picture for each maximum length of the light paths.
+"""Draws the virtual point lights of a USD stage bounce by bounce, and shows them in a window.
 
     python scripts/visualize_vpls.py scenes_usd/cornell_box.usda cloud.png --max-bounces 3
+    python scripts/visualize_vpls.py scenes_usd/cornell_box.usda --paths
 
-writes cloud.0.png (VPLs on the lights), cloud.1.png (also on the first surfaces that light paths hit), ...
+The first command writes cloud.0.png (VPLs on the lights), cloud.1.png (also on the first surfaces that light paths
+hit), ...; the second opens a window, in which a right click on a VPL shows its numbers.
 """
 
 import argparse
@@ -10,30 +12,36 @@ import sys
 from pathlib import Path
 
 import warp_ir as ir
-from warp_ir.preview import picture_vpls
+from warp_ir.preview import COLORINGS, picture_vpls, plotter
+from warp_ir.preview.plot import pick_vpls
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Draw the virtual point lights of a USD stage.")
     parser.add_argument("stage", metavar="STAGE", help="USD file")
-    parser.add_argument(
-        "output", metavar="OUTPUT", type=Path, help=".png file; the number of bounces is added to its name"
-    )
+    parser.add_argument("output", metavar="OUTPUT", type=Path, nargs="?", help=".png file; none: a window opens")
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, ... (default: cpu)")
     parser.add_argument("--light-paths", type=int, default=1024, help="light paths per iteration (default: 1024)")
-    parser.add_argument(
-        "--max-bounces", type=int, default=3, help="maximum number of bounces in the last picture (default: 3)"
-    )
+    parser.add_argument("--max-bounces", type=int, default=3, help="maximum number of bounces (default: 3)")
     parser.add_argument("--view", choices=("camera", "outside"), default="outside", help="viewpoint (default: outside)")
+    colorings = [name for name in COLORINGS if name != "contribution"]
+    parser.add_argument("--color-by", choices=colorings, default="hue", help="meaning of colours (default: hue)")
+    parser.add_argument("--paths", action="store_true", help="also draw the light paths")
     args = parser.parse_args()
 
     scene = ir.load_usd(args.stage)
-    for bounces in range(args.max_bounces + 1):
-        settings = ir.RenderSettings(light_paths=args.light_paths, max_bounces=bounces)
-        vpls = ir.trace_vpls(scene, settings, device=args.device)
-        path = args.output.with_suffix(f".{bounces}.png")
-        picture_vpls(scene, vpls, path, view=args.view)
-        print(f"{path}: {len(vpls.positions)} VPLs, at most {bounces} bounces")
+    settings = ir.RenderSettings(light_paths=args.light_paths, max_bounces=args.max_bounces)
+    vpls = ir.trace_vpls(scene, settings, device=args.device)
+    options = {"view": args.view, "color_by": args.color_by, "paths": args.paths}
+    if args.output is None:
+        plot = plotter(scene, vpls, **options)
+        pick_vpls(plot, vpls)
+        plot.show()
+        return
+    for last in range(args.max_bounces + 1):
+        path = args.output.with_suffix(f".{last}.png")
+        picture_vpls(scene, vpls, path, bounces=range(last + 1), **options)
+        print(f"{path}: {(vpls.bounce <= last).sum()} VPLs, at most {last} bounces")
 
 
 if __name__ == "__main__":

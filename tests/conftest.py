@@ -1,5 +1,7 @@
 """What every test shares: which devices to run on, and a quiet Warp."""
 
+import gc
+
 import pytest
 import warp as wp
 
@@ -27,6 +29,11 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.path.parent.name == "physics" or _LAUNCHING & {*item.fixturenames, *item.function.__code__.co_names}:
             item.add_marker(pytest.mark.xdist_group("kernels"))
+
+
+def pytest_collection_finish():
+    """Modules and tests are no garbage; every collection would look through half a million objects of theirs."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

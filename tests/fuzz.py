@@ -10,7 +10,8 @@ import traceback
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender, UsdShade, UsdSkel, UsdUtils
+import OpenImageIO as oiio
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender, UsdShade, UsdSkel, UsdUtils, Vt
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes_usd"
 MEMORY = 8 << 30
@@ -18,8 +19,9 @@ MEMORY = 8 << 30
 
 
 def seeds(folder: Path) -> list[Path]:
-    """The project's own scenes and a stage with one of everything, each as .usda, .usdc and .usdz."""
+    """The project's own scenes and a stage with one of everything, each as .usda, .usdc and .usdz; images beside."""
     folder.mkdir(exist_ok=True)
+    images(folder)
     found = []
     stages = [*sorted(SCENES.glob("*.usda")), rich_stage(folder / "rich.usda")]
     for source in stages:
@@ -63,6 +65,54 @@ def _paint(stage: Usd.Stage) -> UsdShade.Material:
     )
     material.CreateSurfaceOutput("mtlx").ConnectToSource(surface, "surface")
     return material
+
+
+def _rig(stage: Usd.Stage) -> None:
+    """Two skinned meshes: joints and blend shapes in other orders, in-betweens, both methods, rigid and per point."""
+    root = UsdSkel.Root.Define(stage, "/World/Rig")
+    UsdSkel.BindingAPI.Apply(root.GetPrim())
+    skeleton = UsdSkel.Skeleton.Define(stage, "/World/Rig/Bones")
+    skeleton.CreateJointsAttr(["a", "a/b", "a/b/c"])
+    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1.0)] * 3)
+    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1.0)] * 3)
+    animation = UsdSkel.Animation.Define(stage, "/World/Rig/Move")
+    animation.CreateJointsAttr(["a/b", "a"])
+    animation.CreateTranslationsAttr([(0, 0, 0), (1, 0, 0)])
+    animation.CreateRotationsAttr([Gf.Quatf(1.0)] * 2)
+    animation.CreateScalesAttr([Gf.Vec3h(1.0)] * 2)
+    for code in (1.0, 2.0):
+        animation.GetTranslationsAttr().Set([(code, 0, 0), (1, code, 0)], code)
+    animation.CreateBlendShapesAttr(["up", "away"])
+    animation.CreateBlendShapeWeightsAttr([0.5, 0.25])
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    for name, method, joints in (("Skin", "classicLinear", []), ("Hide", "dualQuaternion", ["a/b", "a/x", "a"])):
+        skin = UsdGeom.Mesh.Define(stage, f"/World/Rig/{name}")
+        skin.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)])
+        skin.CreateFaceVertexCountsAttr([4])
+        skin.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+        skin.CreateNormalsAttr([(0, 0, 1)] * 4)
+        skin.CreateSubdivisionSchemeAttr("none")
+        binding = UsdSkel.BindingAPI.Apply(skin.GetPrim())
+        binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+        binding.CreateSkinningMethodAttr(method)
+        binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+        if joints:
+            binding.CreateJointsAttr(joints)
+        rigid = name == "Hide"
+        binding.CreateJointIndicesPrimvar(rigid, 2).Set([0, 1] * (1 if rigid else 4))
+        binding.CreateJointWeightsPrimvar(rigid, 2).Set([0.5] * (2 if rigid else 8))
+        binding.CreateBlendShapesAttr(["away", "up"])
+        targets = []
+        for shape_name in ("Away", "Up"):
+            shape = UsdSkel.BlendShape.Define(stage, f"/World/Rig/{name}/{shape_name}")
+            shape.CreateOffsetsAttr([(0, 0, 1)] * 2)
+            shape.CreateNormalOffsetsAttr([(0, 1, 0)] * 2)
+            shape.CreatePointIndicesAttr([0, 1])
+            between = shape.CreateInbetween("half")
+            between.SetWeight(0.5)
+            between.SetOffsets([(0, 0, 0.25)] * 2)
+            targets.append(shape.GetPath())
+        binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
 def rich_stage(path: Path) -> Path:
@@ -129,35 +179,78 @@ def rich_stage(path: Path) -> Path:
         light.CreateColorAttr(Gf.Vec3f(1, 0.5, 0.2))
     camera = UsdGeom.Camera.Define(stage, "/World/main_cam")
     camera.AddTranslateOp().Set((0, 0, 9))
-    root = UsdSkel.Root.Define(stage, "/World/Rig")
-    UsdSkel.BindingAPI.Apply(root.GetPrim())
-    skeleton = UsdSkel.Skeleton.Define(stage, "/World/Rig/Bones")
-    skeleton.CreateJointsAttr(["a", "a/b"])
-    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1.0)] * 2)
-    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1.0)] * 2)
-    animation = UsdSkel.Animation.Define(stage, "/World/Rig/Move")
-    animation.CreateJointsAttr(["a", "a/b"])
-    animation.CreateTranslationsAttr([(0, 0, 0), (1, 0, 0)])
-    animation.CreateRotationsAttr([Gf.Quatf(1.0)] * 2)
-    animation.CreateScalesAttr([Gf.Vec3h(1.0)] * 2)
-    animation.CreateBlendShapesAttr(["up"])
-    animation.CreateBlendShapeWeightsAttr([0.5])
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    skin = UsdGeom.Mesh.Define(stage, "/World/Rig/Skin")
-    skin.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)])
-    skin.CreateFaceVertexCountsAttr([4])
-    skin.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
-    binding = UsdSkel.BindingAPI.Apply(skin.GetPrim())
-    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateJointIndicesPrimvar(False, 2).Set([0, 1] * 4)
-    binding.CreateJointWeightsPrimvar(False, 2).Set([0.5] * 8)
-    binding.CreateBlendShapesAttr(["up"])
-    shape = UsdSkel.BlendShape.Define(stage, "/World/Rig/Skin/Up")
-    shape.CreateOffsetsAttr([(0, 0, 1)] * 2)
-    shape.CreatePointIndicesAttr([0, 1])
-    binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath()])
+    _rig(stage)
     stage.GetRootLayer().Save()
     return path
+
+
+PICTURES = {
+    "grey.png": ("uint8", 1),
+    "color.jpg": ("uint8", 3),
+    "alpha.tif": ("uint16", 4),
+    "tiles.tif": ("float", 4),
+    "crop.exr": ("half", 4),
+    "tiles.exr": ("half", 4),
+    "parts.exr": ("half", 4),
+    "sky.hdr": ("float", 3),
+}
+"""Type and number of the channels."""
+IMAGES = (*PICTURES, "lamp.ies")
+
+
+def images(folder: Path) -> list[Path]:
+    """Small pictures of the formats and layouts that are read, and a photometric profile."""
+    for name, (kind, channels) in PICTURES.items():
+        spec = oiio.ImageSpec(16, 8, channels, kind)
+        if name.startswith("crop"):
+            spec.x, spec.y, spec.full_width, spec.full_height = 4, -2, 20, 12
+        if name.startswith("tiles"):
+            spec.tile_width = spec.tile_height = 16
+        parts = (spec,) * (2 if name.startswith("parts") else 1)
+        writer = oiio.ImageOutput.create(str(folder / name))
+        assert writer.open(str(folder / name), parts if len(parts) > 1 else spec), writer.geterror()
+        for k, part in enumerate(parts):
+            assert not k or writer.open(str(folder / name), part, "AppendSubimage"), writer.geterror()
+            assert writer.write_image(np.linspace(0.0, 1.0, 16 * 8 * channels, dtype=np.float32)), writer.geterror()
+        writer.close()
+    rows = "0 45 90\n0 180\n100 50 0\n100 60 0\n"
+    (folder / "lamp.ies").write_text(f"IESNA:LM-63-2002\nTILT=NONE\n1 1000 1 3 2 1 2 0 0 0\n1 1 100\n{rows}")
+    return [folder / name for name in IMAGES]
+
+
+_PICTURED = """#usda 1.0
+def Mesh "Card" (prepend apiSchemas = ["MaterialBindingAPI"]) {{
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    uniform token subdivisionScheme = "none"
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")
+    rel material:binding = </Look>
+}}
+def Material "Look" {{
+    token outputs:surface.connect = </Look/S.outputs:surface>
+    def Shader "S" {{
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </Look/T.outputs:rgb>
+        float inputs:opacity.connect = </Look/T.outputs:a>
+        normal3f inputs:normal.connect = </Look/T.outputs:rgb>
+        token outputs:surface
+    }}
+    def Shader "T" {{
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @{file}@
+        float3 outputs:rgb
+        float outputs:a
+    }}
+}}
+def DomeLight "Sky" {{
+    asset inputs:texture:file = @{file}@
+}}
+def RectLight "Panel" (prepend apiSchemas = ["ShapingAPI"]) {{
+    asset inputs:texture:file = @{file}@
+    asset inputs:shaping:ies:file = @{file}@
+}}
+"""
 
 
 def damage(data: bytes, rng: np.random.Generator) -> bytes:
@@ -228,6 +321,9 @@ def rewrite(text: str, rng: np.random.Generator) -> str:
 
 def _wrong(value: object, rng: np.random.Generator) -> object:
     """An array of another length, or with elements that make no sense."""
+    if isinstance(value, Vt.TokenArray):
+        names = [*value, "nowhere"]
+        return Vt.TokenArray([str(name) for name in rng.choice(names, int(rng.integers(len(names) + 1)))])
     array = np.array(value)
     if array.size == 0:
         return value
@@ -275,10 +371,10 @@ _VALUES = {
 }
 
 
-def misuse(layer: Sdf.Layer, rng: np.random.Generator) -> None:
-    """A few opinions of a layer replaced: wrong lengths, types, indices; cycles; targets that are missing."""
+def misuse(layer: Sdf.Layer, rng: np.random.Generator, below: str = "/") -> None:
+    """A few opinions of a layer's prims replaced: wrong lengths, types, indices; cycles; targets that are missing."""
     paths: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(path) if path.IsPrimPath() else None)
+    layer.Traverse(Sdf.Path(below), lambda path: paths.append(path) if path.IsPrimPath() else None)
     for _ in range(int(rng.integers(1, 5))):
         prim = layer.GetPrimAtPath(paths[int(rng.integers(len(paths)))])
         if not prim:
@@ -316,17 +412,23 @@ def misuse(layer: Sdf.Layer, rng: np.random.Generator) -> None:
 
 
 def mutate(sources: list[Path], folder: Path, seed: int) -> Path:
-    """The file that a seed makes of one of the sources."""
+    """The stage that a seed makes of one of the sources: of four, one is damaged, one has a damaged image."""
     rng = np.random.default_rng(seed)
-    if seed % 2:  # well-formed, and senseless
-        rich = next(source for source in sources if source.name == "rich.usda")
-        path = folder / f"{seed}{'.usda' if seed % 4 == 1 else '.usdc'}"
+    rich = next(source for source in sources if source.name == "rich.usda")
+    if seed % 4 == 2:
+        image = rich.parent / IMAGES[seed // 4 % len(IMAGES)]
+        damaged, path = folder / f"{seed}{image.suffix}", folder / f"{seed}.usda"
+        damaged.write_bytes(damage(image.read_bytes(), rng))
+        path.write_text(_PICTURED.format(file=damaged.name))
+        return path
+    if seed % 2:  # well-formed, and senseless; one of two by its skinned meshes
+        path = folder / f"{seed}{'.usda' if seed % 8 < 4 else '.usdc'}"
         layer = Sdf.Layer.CreateAnonymous(".usda")
         layer.TransferContent(Sdf.Layer.FindOrOpen(str(rich)))
-        misuse(layer, rng)
+        misuse(layer, rng, "/World/Rig" if seed % 4 == 3 else "/")
         layer.Export(str(path))
         return path
-    source = sources[seed // 2 % len(sources)]
+    source = sources[seed // 4 % len(sources)]
     path = folder / f"{seed}{source.suffix}"
     if source.suffix == ".usda" and rng.random() < 0.7:
         path.write_text(rewrite(source.read_text(), rng))

@@ -42,7 +42,7 @@ USD_LAYERS = [
     ["lights"],
     ["shading"],
     ["settings"],
-    ["camera_prim", "diagnose", "linking", "time_varying"],
+    ["camera_prim", "diagnose", "linking", "time_varying", "vpl_layers"],
     ["traverse"],
     ["assemble"],
     ["load"],
@@ -121,9 +121,6 @@ def test_kernels_follow_the_rules(path, kernel):
 
 MAX_LINES, MAX_ARGUMENTS = 75, 10
 EXCEPTIONS = {
-    "bvh/intersect8.py:intersect_triangles",  # native code takes its arrays one by one
-    "bvh/intersect8.py:intersect_padded_triangles",
-    "bvh/traverse.py:traverse_cpu",
     "vpl/emission.py:_trace_light_path",
 }
 """Device functions that are longer than `MAX_LINES` or take more than `MAX_ARGUMENTS`."""

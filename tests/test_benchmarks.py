@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +119,7 @@ def test_compare_fails_if_it_has_become_worse(tmp_path, monkeypatch, factor, cod
     """The exit code is 1 if time x error exceeds the earlier result by 10 %: here the earlier one is `factor` of it."""
     import run
 
-    monkeypatch.setattr(run, "measure_all", lambda *_: ([{**row(), "timings": {}, "counts": {}}], [], {}))
+    monkeypatch.setattr(run, "measure_all", lambda *_, **__: ([{**row(), "timings": {}, "counts": {}}], [], {}))
     old = tmp_path / "old.json"
     old.write_text(json.dumps({"rows": [row(error=0.01 * factor)]}))
     assert run.main(["-k", "furnace_cube", "--estimators", "path", "--compare", str(old)]) == code
@@ -139,6 +142,20 @@ def test_quick_run_writes_everything(tmp_path):
     assert files["png"].read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.extended
+def test_rays_are_counted(tmp_path):
+    """All types of rays and of evaluations have a speed, and Embree, where it is installed, hits the same triangles."""
+    import rays
+
+    assert rays.main(["--quick", "--width", "32", "--json", str(tmp_path / "rays.json")]) == 0
+    result = json.loads((tmp_path / "rays.json").read_text())
+    assert {row["kind"] for row in result["rays"]} == {"camera", "diffuse", "shadow"}
+    for row in result["rays"]:
+        assert row["ours"] > 0.0 and row["empty"] > 0.0
+        assert row.get("agree", 1.0) > 0.98  # shadow rays end a little before their VPL, by different rules
+    assert min(result["gather"][0][key] for key in ("shadowed", "unshadowed", "empty")) > 0.0
+
+
 def test_the_wrinkled_ball_is_closed():
     """Every edge of the procedural ball that has two ends belongs to two triangles, whatever its size."""
     from scaling import ball
@@ -149,3 +166,109 @@ def test_the_wrinkled_ball_is_closed():
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
     _, counts = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
     assert (counts % 2 == 0).all()
+
+
+def test_random_scenes_are_functions_of_their_seed():
+    """A seed gives the same scene each time, another seed another, and ten in a row one of each kind."""
+    from make_references import content_digest
+    from random_scenes import KINDS, random_scene
+
+    scenes = [random_scene(seed) for seed in range(20, 30) if seed % 10 != 8]  # the crowd takes a second
+    assert [scene.name.split("_")[0] for scene in scenes] == [kind for kind in KINDS if kind != "crowd"]
+    assert content_digest(scenes[0]) == content_digest(random_scene(20)) != content_digest(random_scene(30))
+    for scene in scenes:
+        assert scene.lights or any(max(material.emission) > 0.0 for material in scene.materials)
+        assert 300 < scene.triangle_count < 20_000
+
+
+@pytest.mark.extended
+def test_random_scenes_are_lit_and_seen():
+    """What rays against boxes say about a scene, its picture confirms: light comes to where the camera looks."""
+    from random_scenes import random_scene
+
+    import warp_ir as ir
+
+    for seed in (40, 42, 45, 47):
+        settings = ir.RenderSettings(width=16, height=16, iterations=64, filter=False)
+        picture = ir.render(random_scene(seed), settings).radiance().mean(axis=2)
+        assert (picture > 0.0).mean() > 0.6
+        assert np.isfinite(picture).all()
+
+
+def test_patterns_stand_out_from_noise():
+    """White noise has no peak; a tenth of its power in one frequency is one.
+
+    The largest of n exponential variables exceeds log(n) + 7 in 0.1 % of all cases; a wave of the amplitude a among
+    N values of the variance 1 has the power N a²/4 relative to the mean.
+    """
+    from perception import pattern_peak
+
+    random = np.random.default_rng(3)
+    reference = np.full((128, 128, 3), 0.5)
+    noise = random.normal(size=(128, 128, 1)) * np.ones(3)
+    assert pattern_peak(reference + noise, reference) < math.log(128 * 128 / 2) + 7.0
+    y, x = np.mgrid[:128, :128]
+    wave = math.sqrt(0.2) * np.sin(2.0 * math.pi * (40 * x + 24 * y) / 128)[..., None]
+    expected = 128**2 * 0.2 / 4.0
+    assert 0.5 * expected < pattern_peak(reference + noise + wave, reference) < 1.5 * expected
+
+
+def test_meshes_are_merged_by_material():
+    """The peer gets one shape for each material: the same triangles, in the same places."""
+    from make_references import merged
+
+    from warp_ir.procedural import cornell_box
+
+    meshes = cornell_box().meshes
+    few = merged(meshes)
+    assert len(few) == 4 < len(meshes)
+    for found in few:
+        assert len(set(found.material.tolist())) == 1
+
+    def corners(parts):
+        rows = np.concatenate([mesh.points[mesh.triangles].reshape(-1, 9) for mesh in parts])
+        return rows[np.lexsort(rows.T)]
+
+    np.testing.assert_array_equal(corners(few), corners(meshes))
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("seed", [6, 9])
+def test_random_scenes_are_read_back_from_their_stages(tmp_path, seed):
+    """The stage of a random scene holds the scene: points to float32, texels to 8 bits of sRGB that are stored."""
+    from random_scenes import random_scene, write_usd
+
+    import warp_ir as ir
+
+    scene = random_scene(seed)
+    write_usd(scene, tmp_path / "scene.usda")
+    read = ir.load_usd(tmp_path / "scene.usda")
+    assert not read.warnings
+    meshes = {mesh.name.split("/")[-1]: mesh for mesh in read.meshes}
+    assert len(meshes) == len(scene.meshes)
+    for mesh in scene.meshes:
+        other = meshes[mesh.name]
+        np.testing.assert_allclose(other.points[other.triangles], mesh.points[mesh.triangles], atol=1e-5)
+        own, found = scene.materials[mesh.material[0]], read.materials[other.material[0]]
+        np.testing.assert_allclose(found.albedo, own.albedo, atol=1e-3)
+    lights = {light.name.split("/")[-1]: light for light in read.lights}
+    for light in scene.lights:
+        assert lights[light.name].kind == light.kind
+        np.testing.assert_allclose(lights[light.name].radiance, light.radiance, rtol=1e-5)
+    np.testing.assert_allclose(read.camera.fit(1, 1).window, scene.camera.fit(1, 1).window, rtol=1e-6)
+
+
+@pytest.mark.extended
+def test_the_gpu_check_runs_without_a_gpu(tmp_path):
+    """A rehearsal on the CPU: every result is a line of JSON, and no ray escapes, nor light."""
+    import warp as wp
+
+    wp.init()
+    script = BENCHMARKS.parent / "scripts" / "gpu_check.py"
+    command = [sys.executable, str(script), "--device", "cpu", "--quick", "--out", str(tmp_path), "--minutes", "60"]
+    environment = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}
+    subprocess.run([*command, "--only", "start", "leaks"], check=True, env=environment)
+    lines = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert {line["step"] for line in lines} == {"start", "leaks"}
+    assert all(line["ok"] for line in lines)
+    assert "## leaks: done" in (tmp_path / "summary.md").read_text()

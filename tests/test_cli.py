@@ -118,10 +118,21 @@ def test_stats(tmp_path):
 
     found = json.loads(stats.read_text(), parse_constant=no_constants)
     assert found["iterations"] == 2 and found["device"] == "cpu" and found["settings"]["light_paths"] == 16
-    assert {"import", "load", "compile", "upload", "write"} <= set(found["timings"])
+    timings = found["timings"]
+    assert {"import", "load", "compile", "upload", "render", "write"} <= set(timings)
+    # The time since the start of the command holds all that happens before the picture is written, each by its name.
+    assert sum(timings[step] for step in ("import", "load", "upload", "render")) <= found["seconds"]
     assert found["loaded"]["triangles"] == 30 and found["counts"]["iterations"] == 2
     assert found["peak_memory_bytes"] > 1 << 20 and found["versions"]["warp_ir"] == warp_ir.__version__
     assert found["output"] == [str(tmp_path / "a.png")] and 0.0 < found["error"] < 10.0
+
+
+def test_a_limit_that_no_iteration_fits_gives_one(tmp_path, capsys):
+    """A time limit of a millisecond gives a picture of one iteration, and a warning with the time that it took."""
+    assert main(["render", ROOM, str(tmp_path / "a.png"), *SMALL[:2], *SMALL[4:], "--time-limit", "0.001"]) == 0
+    captured = capsys.readouterr()
+    assert ", 1 iterations in" in captured.out
+    assert re.search(r"--time-limit 0.001: the picture took \S+ s, as one iteration is the least", captured.err)
 
 
 def test_stats_of_frames(tmp_path):
@@ -208,7 +219,7 @@ class Stopped:
     def new_film(self):
         return Interrupted()
 
-    def render(self, film, progress):
+    def render(self, film, progress, **_):
         return film
 
 
@@ -304,7 +315,7 @@ def test_the_process_ends_in_order(stage, code):
         (["render", "missing.usda", "a.png"], "missing.usda: no such file"),
         (["render", __file__, "a.png"], "cannot be opened as USD"),
         (["info", "missing.usda"], "missing.usda: no such file"),
-        (["vpls", ROOM, "a.exr"], "unknown extension '.exr'; known are .png .usda .npz"),
+        (["vpls", ROOM, "a.exr"], "unknown extension '.exr'; known are .png .html .gltf .gif .mp4 .usda .npz"),
         (["vpls", ROOM, "a.npz", "--iteration", "-1"], "--iteration: must be at least 0"),
         (["compare", ROOM, "a.exr"], "a.exr: unknown extension '.exr'; known are .png"),
         (["compare", ROOM, "--json", "a.txt"], "a.txt: unknown extension '.txt'; known are .json"),
@@ -313,7 +324,12 @@ def test_the_process_ends_in_order(stage, code):
         (["compare", ROOM, "--seeds", "0"], "--seeds: must be a whole number from 1 to 1000, is '0'"),
         (["compare", ROOM, "--methods", "vpl, magic"], "unknown 'magic'; known are vpl, vpl without filter"),
         (["compare", ROOM, "--methods", ","], "--methods: names no method"),
-        (["compare", ROOM, "--iterations", "4"], "unrecognized arguments: --iterations 4"),
+        (["compare", ROOM, "--iterations", "4"], "--iterations 4 (see warp-ir compare --help)"),
+        (["render", ROOM, "a.png", "--threads", "0"], "--threads: must be a whole number from 1 to 1000"),
+        (["vpls", ROOM, "a.npz", "--paths"], "--paths: has no effect on .npz"),
+        (["vpls", ROOM, "a.png", "--as-lights"], "--as-lights: needs a .usda file"),
+        (["vpls", ROOM, "a.usda", "--contribution-to", "3,4"], "--contribution-to: has no effect on .usda"),
+        (["render", ROOM, "a.####.png"], "a.####.png: #### is the place of a frame number, which needs --frames"),
         (["compare", ROOM, "--width", "0"], "--width: must be a whole number of at least 1, is 0"),
         (["compare", "missing.usda"], "missing.usda: no such file"),
         (["render", ROOM, "a.png", "--purposes", "final"], "unknown 'final'; known are default, render"),

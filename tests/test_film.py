@@ -1,6 +1,9 @@
 """Films add, and say how sure they are."""
 
+import base64
 import math
+import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +78,36 @@ def test_films_of_different_size_do_not_merge(device):
     dark = Renderer(furnace(0.5, 0.0, level=1), SETTINGS, device=device)
     with pytest.raises(ir.InputError, match="a film with emission and one without"):
         renderer.new_film().merge(dark.new_film())
+
+
+def test_iterations_of_another_scene_are_refused(device):
+    """A film takes iterations of the renderer that made it, and none after the scene was replaced."""
+    renderer = Renderer(furnace(level=1), SETTINGS, device=device)
+    film = renderer.new_film()
+    renderer.add_iteration(film, 0)
+    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+        Renderer(furnace(level=1), SETTINGS, device=device).add_iteration(film, 1)
+    renderer.update(furnace(0.3, level=1))
+    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+        renderer.add_iteration(film, 1)
+
+
+def test_threads_take_turns(device):
+    """Films of one renderer that three threads fill at the same time have the bits of films filled alone."""
+    renderer = Renderer(cornell_box(), ir.RenderSettings(width=24, light_paths=64, iterations=4), device=device)
+    expected = renderer.render().radiance()
+    with ThreadPoolExecutor(3) as threads:
+        films = [threads.submit(renderer.render) for _ in range(3)]
+    for film in films:
+        np.testing.assert_array_equal(film.result().radiance(), expected)
+
+
+def test_a_notebook_shows_picture_time_and_error(device):
+    """The page of a film holds its picture as PNG, and says how many iterations it has and what error."""
+    film = Renderer(furnace(level=1), SETTINGS, device=device).render()
+    page = film._repr_html_()
+    data = base64.b64decode(re.search(r"base64,([^\"]+)", page).group(1))
+    assert data.startswith(b"\x89PNG") and f"{film.iterations} iterations" in page and "estimated error" in page
 
 
 def test_values_that_are_not_finite_stay_out(device):
@@ -190,3 +223,24 @@ def test_visible_lights_have_alpha(light, tmp_path):
     np.testing.assert_array_equal(ir.Film.load(tmp_path / "f.npz").aov("alpha"), alpha)
     with pytest.raises(ir.InputError, match="one without"):
         film.merge(hidden)
+
+
+def test_change_between_pictures_is_their_noise():
+    """Pictures of 2 and 4 of the same iterations tell the noise of four; tiles without new iterations keep theirs.
+
+    One tile has independent noise of variance 1 per iteration and channel: the sum of 192 squares is known to
+    √(2/192) = 10 % in each of two doublings. Five of those; the larger of two is larger than the mean.
+    """
+    from warp_ir.film.picture_noise import PictureNoise
+
+    samples = 100.0 + np.random.default_rng(0).normal(size=(4, 8, 8, 3))
+    pictures = {n: samples[:n].mean(axis=0).astype(np.float32) for n in (1, 2, 4)}
+    noise = PictureNoise.first(pictures[1], np.array([1], np.int32))
+    for n in (2, 4):
+        noise = noise.updated(pictures[n], np.array([n], np.int32))
+    relative = 192 / (4 * 100.0**2 * 1.01)  # of four iterations; L² + ε is 1.01 L²
+    error = noise.squared_errors(np.array([4], np.int32))
+    np.testing.assert_allclose(error, 2.0 * relative, rtol=0.5)  # twice: the allowance for bias
+    kept = noise.updated(pictures[4], np.array([4], np.int32))
+    np.testing.assert_array_equal(kept.variance, noise.variance)
+    assert np.isnan(PictureNoise.first(pictures[1], np.array([1], np.int32)).squared_errors(np.array([1]))).all()

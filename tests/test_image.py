@@ -101,6 +101,16 @@ def test_exr_attributes(tmp_path, film):
     assert found["warp_ir:big"] == 2.0**40 and "warp_ir:camera" not in found
 
 
+def test_tiff_has_sixteen_bits_and_alpha(tmp_path, film):
+    """A .tif is the .png with 256 times finer steps."""
+    write_image(tmp_path / "a.tif", film)
+    write_image(tmp_path / "a.png", film)
+    fine, coarse = read_image(tmp_path / "a.tif"), read_image(tmp_path / "a.png")
+    assert fine.shape == coarse.shape
+    np.testing.assert_allclose(fine, coarse, atol=0.51 / 255.0)
+    assert (np.round(fine * 65535.0) % 257.0 != 0.0).any()  # 8 bits are multiples of 257 of them
+
+
 @pytest.mark.parametrize("name", list(COLOR_SPACES))
 def test_colour_spaces_are_usds(name):
     """The matrices are those of GfColorSpace, and white stays white."""
@@ -180,7 +190,7 @@ def test_grey_arrays_and_alpha_arrays(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("a.tiff", "unknown extension '.tiff'"),
+        ("a.bmp", "unknown extension '.bmp'"),
         ("a", "unknown extension ''"),
         ("missing/a.png", "there is no folder"),
         ("", "is a folder"),

@@ -114,6 +114,8 @@ def test_import_is_light():
     heavy = "warp", "pxr", "numpy", "pyvista", "vtk", "OpenImageIO", "rich", "matplotlib", "scipy"
     code = f"import sys, warp_ir; print([name for name in {heavy} if name in sys.modules])"
     assert fresh(code).strip() == "[]"
+    code = "import time; begin = time.process_time(); import warp_ir; print(time.process_time() - begin)"
+    assert float(fresh(code)) < 0.15  # seconds of CPU time
 
 
 def test_every_public_name_exists():

@@ -1,13 +1,17 @@
-"""Pictures of VPL clouds, without a display."""
+"""VPLs in their scene: pictures, pages, models and animations, without a display."""
 
+import json
+import shutil
+import subprocess
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from warp_ir import Camera, InputError, Projection, Scene
+from warp_ir import Camera, InputError, Mesh, Projection, RenderSettings, Scene, trace_vpls
 from warp_ir.image.io import read_image
-from warp_ir.preview import dot_colors, picture_vpls
+from warp_ir.preview import animate_vpls, picture_vpls, plotter, write_html, write_model
+from warp_ir.preview.plot import dot_colors
 from warp_ir.procedural import cornell_box
 
 
@@ -20,6 +24,10 @@ def cloud(positions, intensity, directional=None, bounce=None):
         intensity=np.asarray(intensity, dtype=float).reshape(n, 3),
         bounce=np.zeros(n, dtype=int) if bounce is None else np.asarray(bounce),
         directional=np.zeros(n, dtype=bool) if directional is None else np.asarray(directional),
+        path=np.arange(n),
+        parent=np.full(n, -1),
+        contribution=None,
+        pixel_position=None,
     )
 
 
@@ -41,8 +49,12 @@ def test_colors_of_nothing():
 def test_vpl_is_where_the_camera_sees_it(tmp_path, projection):
     """A green VPL at 3/4 of the width and 1/4 of the height is green pixels there, off-centre window and all."""
     window = (-1.0, 3.0, -3.0, 1.0)
-    scene = Scene(camera=Camera(window=window, projection=projection))
-    path = picture_vpls(scene, cloud([[2, 0, -1]], [[0, 1, 0]]), tmp_path / "a.png", view="camera", width=80)
+    # A triangle behind the camera makes the scene, and so the discs, larger than a pixel.
+    behind = Mesh("behind", np.array([[-8, 0, 9], [8, 0, 9], [0, 8, 9.0]]), np.array([[0, 1, 2]]), np.zeros(1, int))
+    scene = Scene((behind,), camera=Camera(window=window, projection=projection))
+    vpl = cloud([[2, 0, -1]], [[0, 1, 0]])
+    vpl.normals[:] = 0, 0, 1  # towards the camera
+    path = picture_vpls(scene, vpl, tmp_path / "a.png", view="camera", width=80)
     pixels = read_image(path)[..., :3]
     green = np.argwhere(pixels[..., 1] > 0.9)
     assert pixels.shape == (80, 80, 3) and len(green)
@@ -76,3 +88,93 @@ def test_bad_requests_are_named(tmp_path):
         picture_vpls(Scene(), nothing, tmp_path / "a.gif")
     with pytest.raises(InputError, match="view: must be outside or camera"):
         picture_vpls(Scene(), nothing, tmp_path / "a.png", view="inside")
+
+
+def test_choices_that_cannot_be_are_named():
+    """A colouring that needs contributions is refused without them, and so is a choice by them."""
+    nothing = cloud(np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(InputError, match="color_by: must be one of"):
+        plotter(Scene(), nothing, color_by="size", off_screen=True)
+    with pytest.raises(InputError, match="no contribution"):
+        plotter(Scene(), nothing, min_contribution=0.5, off_screen=True)
+
+
+@pytest.mark.extended
+class TestOfTheCornellBox:
+    """What is drawn of real VPLs."""
+
+    SCENE = cornell_box()
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def vpls(cls):
+        return trace_vpls(cls.SCENE, RenderSettings(width=64, light_paths=64, seed=1), contribution_to=(32, 48))
+
+    def test_bounces_and_contributions_choose_vpls(self, vpls):
+        """As many discs are drawn as there are VPLs after these bounces, or with at least this contribution."""
+        first = plotter(self.SCENE, vpls, bounces=[1], color_by="bounce", off_screen=True)
+        assert first.actors["vpls"].mapper.dataset.n_cells == np.count_nonzero(vpls.bounce == 1)
+        contribution = vpls.contribution.mean(axis=1)
+        strong = contribution >= 0.1 * contribution.max()
+        chosen = plotter(self.SCENE, vpls, min_contribution=0.1, color_by="contribution", off_screen=True)
+        assert sorted(chosen.actors["vpls"].mapper.dataset.cell_data["vpl"]) == np.flatnonzero(strong).tolist()
+        for plot in (first, chosen):
+            plot.close()
+
+    def test_paths_and_shadow_rays_are_lines(self, vpls):
+        """There is a line to every VPL on a surface, and one from the pixel to every VPL that lights it."""
+        plot = plotter(self.SCENE, vpls, paths=True, color_by="flux", off_screen=True)
+        assert plot.actors["paths"].mapper.dataset.n_cells == np.count_nonzero(vpls.parent >= 0) > 0
+        lit = (vpls.contribution > 0.0).any(axis=1)
+        rays = plot.actors["shadow rays"].mapper.dataset
+        assert rays.n_cells == np.count_nonzero(lit) > 0
+        np.testing.assert_allclose(rays.points[0], vpls.pixel_position, rtol=1e-5)
+        plot.close()
+
+    def test_a_click_on_a_disc_tells_its_numbers(self, vpls):
+        """The text of a picked VPL names its index, its bounce and its contribution."""
+        from warp_ir.preview.plot import describe
+
+        lines = describe(vpls, 5).splitlines()
+        assert lines[0].startswith(f"VPL 5, bounce {vpls.bounce[5]}, parent {vpls.parent[5]}")
+        assert lines[-1].startswith("contribution ")
+
+    def test_a_model_has_the_colours(self, vpls, tmp_path):
+        """The .gltf is complete in itself, and its meshes have vertex colours."""
+        plot = plotter(self.SCENE, vpls, off_screen=True)
+        model = json.loads(write_model(plot, tmp_path / "a.gltf").read_text())
+        plot.close()
+        assert all(buffer["uri"].startswith("data:") for buffer in model["buffers"])
+        colored = [p for mesh in model["meshes"] for p in mesh["primitives"] if "COLOR_0" in p["attributes"]]
+        assert len(colored) >= 2
+
+    @pytest.mark.parametrize("suffix", ["gif", "mp4"])
+    def test_an_animation_has_a_frame_for_every_step(self, vpls, tmp_path, suffix):
+        """Bounce by bounce: twelve frames for each, and as many at the end."""
+        imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'view'")
+        path = animate_vpls(self.SCENE, vpls, tmp_path / f"a.{suffix}", order="bounce", width=64)
+        with imageio.get_reader(path) as reader:
+            shown = reader.count_frames() if suffix == "mp4" else len(reader)
+        steps = len(np.unique(vpls.bounce))
+        # A .gif stores equal frames once.
+        assert shown == 12 * (steps + 1) if suffix == "mp4" else 1 < shown <= 12 * (steps + 1)
+
+    def test_a_page_shows_the_scene_in_a_browser(self, vpls, tmp_path):
+        """The page asks no network, and a browser draws the red wall and the discs."""
+        pytest.importorskip("trame_pyvista", reason="needs the extra 'view'")
+        plot = plotter(self.SCENE, vpls, off_screen=True)
+        page = write_html(plot, tmp_path / "a.html")
+        plot.close()
+        text = page.read_text(encoding="utf-8")
+        assert "<script src=" not in text and 'rel="stylesheet" href="http' not in text
+        browser = shutil.which("chromium") or shutil.which("google-chrome")
+        if browser is None:
+            pytest.skip("needs Chromium")
+        flags = "--headless --no-sandbox --disable-gpu --use-gl=swiftshader --enable-unsafe-swiftshader".split()
+        size = ["--window-size=400,300", "--virtual-time-budget=20000"]
+        shot = tmp_path / "a.png"
+        command = [browser, *flags, *size, f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}"]
+        subprocess.run([*command, page.as_uri()], check=True, capture_output=True, timeout=120)
+        pixels = read_image(shot)[..., :3]
+        red = (pixels[..., 0] > 0.2) & (pixels[..., 0] > 2.0 * pixels[..., 1])
+        assert red.mean() > 0.02

@@ -137,3 +137,49 @@ def test_warps(launcher, normal):
     for value in (1.0 - z**2, (disk**2).sum(axis=1), h / cone):
         counts = np.histogram(value, bins=16, range=(0, 1 + 1e-6))[0]
         assert stats.chisquare(counts).pvalue > 1e-3
+
+
+@wp.kernel
+def _index_pixels(first: int, columns: int, scramble: wp.uint32, out: wp.array[wp.int32]):
+    i = first + wp.tid()
+    out[i] = sobol.index_of_pixel(i % columns, i // columns, scramble)
+
+
+@pytest.fixture(scope="module")
+def index_pixels(launcher):
+    def index_pixels(size, scramble):
+        out = launcher.empty(size * size, wp.int32)
+        launcher.launch(_index_pixels, size * size, [size, wp.uint32(scramble), out])
+        return out.numpy().reshape(size, size)
+
+    return index_pixels
+
+
+@pytest.mark.parametrize("scramble", [0, 1, 0xDEADBEEF])
+def test_squares_of_pixels_use_aligned_runs_of_points(index_pixels, scramble):
+    """The 4^k pixels of every aligned square use one aligned run of 4^k points: so squares are stratified."""
+    size = 256
+    index = index_pixels(size, scramble)
+    for k in range(1, 7):
+        side = 1 << k
+        squares = index.reshape(size // side, side, size // side, side).swapaxes(1, 2).reshape(-1, 4**k)
+        squares.sort(axis=1)
+        np.testing.assert_array_equal(squares, (squares[:, :1] // 4**k) * 4**k + np.arange(4**k))
+
+
+def test_squares_of_pixels_are_visited_in_different_orders(index_pixels):
+    """2 x 2 pixels come in all 24 orders, independent of those of neighbours and of other scrambles: χ² of pairs."""
+    index = np.array([index_pixels(256, scramble) for scramble in (5, 6)]) % 4
+    squares = index.reshape(2, 128, 2, 128, 2).swapaxes(2, 3).reshape(2, 128, 128, 4)
+    codes = squares @ [64, 16, 4, 1]
+    order = np.unique(codes, return_inverse=True)[1].reshape(codes.shape)
+    pairs = (
+        (order[0, :, :-1], order[0, :, 1:]),
+        (order[0, :-1], order[0, 1:]),
+        (order[0, :-1, :-1], order[0, 1:, 1:]),
+        (order[0], order[1]),
+    )
+    for one, other in pairs:
+        counts = np.bincount((24 * one + other).reshape(-1), minlength=24 * 24)
+        assert len(counts) == 24 * 24
+        assert stats.chisquare(counts).pvalue > 1e-4

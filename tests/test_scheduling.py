@@ -1,11 +1,13 @@
 """Iterations are for the tiles that need them, and end where a limit is reached."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import warp_ir as ir
+from warp_ir.film import Film
 from warp_ir.procedural import cornell_box
 from warp_ir.renderer import Renderer
 from warp_ir.scheduling import AdaptiveScheduler, select_tiles
@@ -144,6 +146,37 @@ def test_what_is_asked_for_is_not_left_out(more):
     settings = ir.RenderSettings(width=36, height=20, light_paths=64, target_error=0.2, **more)
     film = ir.render(cornell_box(), settings)
     assert film.skipped == 0
+
+
+@pytest.mark.parametrize("limit, iterations", [(0.7, 2), (0.45, 1), (0.2, 1), (3.0, None)])
+def test_a_time_limit_is_that_of_the_call(monkeypatch, limit, iterations):
+    """By a simulated clock: uploading takes 0.05 s, a first look 0.05 s, an iteration 0.3 s and the picture 0.1 s.
+
+    That is 0.5 s with one iteration, which is the least; in 0.7 s some tiles get another, a fifth of the time that is
+    left for them being kept in case they take longer than the mean.
+    """
+    now = [0.0]
+
+    def taking(seconds, function):
+        def timed(self, *arguments):
+            now[0] += seconds(self, *arguments) if callable(seconds) else seconds
+            return function(self, *arguments)
+
+        return timed
+
+    monkeypatch.setattr("warp_ir.renderer.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    for name, seconds in (
+        ("_upload", 0.05), ("new_film", 0.05), ("add_iteration", lambda _, film, i: 0.06 + 0.24 * film.chosen.mean()),
+    ):  # fmt: skip
+        monkeypatch.setattr(Renderer, name, taking(seconds, getattr(Renderer, name)))
+    monkeypatch.setattr(Film, "radiance", taking(0.1, Film.radiance))
+    monkeypatch.setattr(Renderer, "_picture_seconds", lambda *_: 0.1)
+    update = AdaptiveScheduler.update
+    monkeypatch.setattr(AdaptiveScheduler, "update", lambda self, reserve, fixed_share: update(self, reserve, 0.2))
+    film = ir.render(cornell_box(), ir.RenderSettings(width=64, height=64, light_paths=16, time_limit=limit))
+    assert iterations in (None, film.iterations)
+    assert film.seconds == pytest.approx(now[0]) and film.seconds <= max(limit, 0.5)
+    assert film.seconds > 0.93 * limit and (film.skipped > 0) == (limit > 0.5)
 
 
 def test_the_time_that_is_left_goes_to_the_worst_tiles():

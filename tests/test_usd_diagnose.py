@@ -155,6 +155,10 @@ ROOM = """
 def Cube "Room" { }
 def SphereLight "L" { float inputs:radius = 0.1
 }
+def Cube "Coal" {
+    double size = 0.01
+    color3f[] primvars:displayColor = [(0, 0, 0)]
+}
 """
 
 
@@ -164,12 +168,13 @@ def SphereLight "L" { float inputs:radius = 0.1
         (["--eye", "-3", "0", "0"], "eye: no light reaches what the camera sees"),
         (["--eye", "-1", "0.1", "0.2", "--look-at", "0", "0", "0"], "eye: it lies in the surface of /Room"),
         (["--eye", "0.5", "0.2", "0.1", "--mask", "/Room", "--default-light", "none"], "eye: no light reaches"),
+        (["--mask", "/Coal", "--default-light", "dome"], "framing camera: the surfaces that the camera sees reflect"),
         (["--eye", "0.5", "0.2", "0.1"], ""),
         (["--eye", "-3", "0", "0", "--mask", "/Room"], ""),
     ],
 )
 def test_black_pictures_say_so(tmp_path, capsys, flags, word):
-    """From outside a closed room, in its wall, without light: it is said, and no error claimed; others say nothing."""
+    """Of a closed room from outside, from in its wall, without light, of coal: it is said, and no error claimed."""
     file, picture = tmp_path / "a.usda", tmp_path / "a.npy"
     file.write_text("#usda 1.0\n" + ROOM)
     assert main(["render", str(file), str(picture), "--width", "8", "--iterations", "4", *flags]) == 0

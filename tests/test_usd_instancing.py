@@ -624,7 +624,7 @@ def test_what_is_stored(tmp_path):
     # Two colours above, five places: two looks of one geometry.
     scene = load(tmp_path, STAGES["native, colored above"])
     assert [len(group.matrices) for group in scene.instances] == [3, 2]
-    assert scene.meshes[0].points is scene.meshes[1].points
+    assert np.shares_memory(scene.meshes[0].points, scene.meshes[1].points)
 
 
 def test_large_prototypes_are_stored_once_and_small_ones_written_out(tmp_path):

@@ -70,6 +70,29 @@ def test_beyond_the_edges_black_is_biased_too(tmp_path, image):
     assert only_material(load(tmp_path, text + mesh())).albedo_texture.outside == (0.25, 0.5, 0.0)
 
 
+def test_images_keep_their_own_borders(tmp_path, image):
+    """MaterialX's address mode constant: the border is the node's default, also where materials share the image."""
+    text = ""
+    for name, default in (("A", "(1, 0, 0)"), ("B", "(0, 1, 0)")):
+        surface = "ND_standard_surface_surfaceshader"
+        inputs = f"color3f inputs:base_color.connect = </{name}/T.outputs:out>"
+        text += material_text(inputs, name, surface, "mtlx:surface").rstrip()[:-1]
+        text += f"""
+    def Shader "T" {{
+        uniform token info:id = "ND_image_color3"
+        asset inputs:file = @a.png@
+        color3f inputs:default = {default}
+        string inputs:uaddressmode = "constant"
+        string inputs:vaddressmode = "constant"
+        color3f outputs:out
+    }}
+}}
+""" + mesh(name=f"M{name}", material=f"/{name}")
+    one, other = (material.albedo_texture for material in load(tmp_path, text).materials)
+    assert one.outside == (1.0, 0.0, 0.0) and other.outside == (0.0, 1.0, 0.0)
+    assert np.array_equal(one.pixels, other.pixels)
+
+
 @pytest.mark.parametrize("wrap", ["repeat", "clamp"])
 def test_the_wrap_mode_that_files_forget(tmp_path, image, wrap):
     """`texture_wrap` is what unsaid edges are."""

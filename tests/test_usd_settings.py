@@ -199,7 +199,7 @@ def test_a_folder_without_products_is_an_error(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", ["../../evil.exr", "C:\\\\evil.exr", "..", "/", "a\\nb.exr", "render.$F4.exr", "x.tif", "sub/dir/"]
+    "name", ["../../evil.exr", "C:\\\\evil.exr", "..", "/", "a\\nb.exr", "render.$F4.exr", "x.bmp", "sub/dir/"]
 )
 def test_a_stage_names_no_place_to_write(tmp_path, name):
     """Whatever a productName says, one file appears, in the user's folder."""

@@ -194,6 +194,17 @@ def test_a_mesh_and_an_animation_can_order_blend_shapes_differently(tmp_path):
     assert scene.meshes[0].points == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize("weight", [1, 0.5])
+def test_offsets_that_are_no_vectors_are_named(tmp_path, weight):
+    """Normal offsets of another type, of a shape or of its inbetween: a warning, and the mesh at rest."""
+    bad = "= [1, 2]\n"
+    blend = BLEND.replace("vector3f[] normalOffsets = [(0, 0, 1), (0, 0, 1)]", f"int[] normalOffsets {bad}")
+    blend = blend.replace("(weight = 0.5)", f"(weight = 0.5)\n uniform int[] inbetweens:half:normalOffsets {bad}")
+    scene = load(tmp_path, strip(mesh=blend, weight=weight), time=10.0)
+    assert warned(scene, "/Root/M", "ormalOffsets is a IntArray", "rest pose")
+    assert scene.meshes[0].points == pytest.approx(REST)
+
+
 def test_instances_share_a_pose_unless_their_animations_differ(tmp_path):
     """A rig inside a prototype is posed once; with an animation above each instance, each has its own pose."""
     rig = strip(animation="").replace('def SkelRoot "Root" {', 'over "Root" {\ndef SkelRoot "Rig" {') + "\n}"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import warp_ir as ir
+from tests.physics.closed_form import placed
 from warp_ir.procedural import cornell_box, floor, furnace
 from warp_ir.scene import LightKind
 from warp_ir.vpl.emission import survivors
@@ -119,3 +120,34 @@ def test_those_that_find_room_stand_for_all(monkeypatch, noted, device):
         share = (every.bounce[8192:] == bounce).mean()
         spread = math.sqrt(1000 * share * (1 - share))
         assert abs((some.bounce[8192:] == bounce).sum() - 1000 * share) < 5 * spread
+
+
+def test_every_vpl_knows_where_its_light_came_from(device):
+    """The parent of a VPL lies on the same path, one bounce before, and sees it along a straight line."""
+    scene = furnace(0.7, shape="cube")
+    for absorption in ("fractional", "roulette"):
+        vpls = trace(scene, device, light_paths=128, absorption=absorption)
+        child = np.flatnonzero(vpls.bounce > 0)
+        parent = vpls.parent[child]
+        assert (parent >= 0).all() and (vpls.parent[vpls.bounce == 0] == -1).all()
+        np.testing.assert_array_equal(vpls.bounce[parent], vpls.bounce[child] - 1)
+        np.testing.assert_array_equal(vpls.path[parent], vpls.path[child])
+        # In a convex room light travels from the lit side of one to the lit side of the other.
+        along = vpls.positions[child] - vpls.positions[parent]
+        assert (np.einsum("nk,nk->n", along, vpls.normals[parent]) > 0.0).all()
+        assert (np.einsum("nk,nk->n", along, vpls.normals[child]) < 0.0).all()
+
+
+@pytest.mark.extended
+def test_contribution_of_a_point_light_to_a_pixel(device):
+    """A point light of intensity I adds ρ/π I cosθ/d² to the pixel that sees the floor below it, and only there."""
+    light = ir.Light("lamp", LightKind.POINT, (3.0, 2.0, 1.0), world_from_light=placed(np.eye(3), (0.5, 2.0, 0.0)))
+    camera = ir.Camera.look_at(eye=(0.0, 4.0, 0.0), target=(0.0, 0.0, 0.0), up=(0.0, 0.0, -1.0), fov=30.0)
+    scene = dataclasses.replace(floor(light, albedo=0.5), camera=camera)
+    settings = ir.RenderSettings(width=9, height=9, light_paths=16, max_bounces=0)
+    vpls = ir.trace_vpls(scene, settings, device=device, contribution_to=(4, 4))
+    np.testing.assert_allclose(vpls.pixel_position, 0.0, atol=1e-3)
+    expected = 0.5 / math.pi * np.array([3.0, 2.0, 1.0]) * 2.0 / (0.25 + 4.0) ** 1.5
+    np.testing.assert_allclose(vpls.contribution.sum(axis=0), expected, rtol=1e-3)
+    with pytest.raises(ir.InputError, match="contribution_to"):
+        ir.trace_vpls(scene, settings, device=device, contribution_to=(9, 0))

@@ -43,7 +43,7 @@ class Renderer:
     def __init__(
         self,
         scene: Scene,
-        settings: RenderSettings,
+        settings: RenderSettings | None = None,
         *,
         device: str = "cpu",
         threads: int | None = None,
@@ -53,7 +53,7 @@ class Renderer:
 
         Args:
             scene: What to render.
-            settings: How to render it.
+            settings: How to render it; None: what the scene's file asks for (`Scene.settings`), and else the defaults.
             device: "cpu", "cuda" or "cuda:N".
             threads: CPU threads; by default one per core. The picture does not depend on it.
             guiding: When light paths are guided; None: never.
@@ -61,6 +61,7 @@ class Renderer:
         Raises:
             InputError: The scene, the settings or the device cannot be used.
         """
+        settings = settings or RenderSettings(**scene.settings)
         self.wanted = settings
         """The settings as given; in `settings` the height is definite."""
         if settings.denoise:
@@ -70,6 +71,7 @@ class Renderer:
         self._guiding = guiding
         self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._shutter: list[_ShutterState] = []
+        self._origin: object = None  # of the films of this upload
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
         estimator = ESTIMATORS[settings.estimator]
@@ -82,16 +84,17 @@ class Renderer:
     def update(self, scene: Scene) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.
 
-        Films of the old scene must not be added to afterwards.
+        Nothing can be added to films of the old scene afterwards.
 
         Raises:
             InputError: The scene cannot be used.
         """
-        self.launcher.profile.clear()
-        self._reported = {}, {}
-        self._take_settings(scene)
-        with self.launcher.loading():
-            self._upload(scene)
+        with self.launcher.exclusive:
+            self.launcher.profile.clear()
+            self._reported = {}, {}
+            self._take_settings(scene)
+            with self.launcher.loading():
+                self._upload(scene)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -108,50 +111,73 @@ class Renderer:
 
     def new_film(self) -> Film:
         """An empty film of the size that the settings ask for."""
-        first = self._shutter[0]
-        assert self._layout is not None
-        film = Film(
-            first.camera.columns,
-            first.camera.rows,
-            self.launcher,
-            first.scene.frame,
-            has_emission=self._layout.emission,
-            sees_lights=self._resolved.visible_lights,
-            sees_dome=self._resolved.visible_lights
-            and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
-        )
-        film.settings = self.settings
-        film.emits = any(state.scene.emits for state in self._shutter)
-        if self._resolved.filter:
-            self._gbuffer.tiles = film.tiles
-            film.reconstruction = Reconstruction(
-                self._shutter, self.launcher, self._gbuffer, self._block, self.settings.seed
+        with self.launcher.exclusive:
+            first = self._shutter[0]
+            assert self._layout is not None
+            film = Film(
+                first.camera.columns,
+                first.camera.rows,
+                self.launcher,
+                first.scene.frame,
+                has_emission=self._layout.emission,
+                sees_lights=self._resolved.visible_lights,
+                sees_dome=self._resolved.visible_lights
+                and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
             )
-        return film
+            film.settings, film.origin = self.settings, self._origin
+            film.emits = any(state.scene.emits for state in self._shutter)
+            if self._resolved.filter:
+                self._gbuffer.tiles = film.tiles
+                film.reconstruction = Reconstruction(
+                    self._shutter, self.launcher, self._gbuffer, self._block, self.settings.seed
+                )
+            return film
 
     def add_iteration(self, film: Film, iteration: int) -> None:
-        """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number."""
-        self._gbuffer.tiles = film.tiles
-        number = stratum(iteration, len(self._shutter).bit_length() - 1)
-        state = self._shutter[number]
-        state.estimator.estimate(iteration, self._gbuffer)
-        with self.launcher.phase("film"), self.launcher.uninterruptible():  # an iteration is added whole or not at all
-            film.add(self._gbuffer, state.exposure, number)
-        wp.synchronize_device(self.launcher.device)
+        """Adds iteration number `iteration` to a film: a pure function of the scene, the settings and that number.
 
-    def render(self, film: Film | None = None, progress: Callable[[Progress], None] | None = None) -> Film:
-        """Adds iterations to a film until one of the settings' limits is reached.
+        Films of one renderer may be added to from several threads: they take turns.
 
-        SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and
+        Raises:
+            InputError: The film was not made by `new_film` of this renderer for the present scene.
+        """
+        with self.launcher.exclusive:
+            if film.origin is not self._origin:
+                raise InputError("film: is not of this renderer and its present scene; new_film() makes one")
+            self._gbuffer.tiles = film.tiles
+            number = stratum(iteration, len(self._shutter).bit_length() - 1)
+            state = self._shutter[number]
+            state.estimator.estimate(iteration, self._gbuffer)
+            # An iteration is added whole or not at all.
+            with self.launcher.phase("film"), self.launcher.uninterruptible():
+                film.add(self._gbuffer, state.exposure, number)
+            wp.synchronize_device(self.launcher.device)
+
+    def render(
+        self,
+        film: Film | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        *,
+        started: float | None = None,
+        reserve: float = 0.0,
+    ) -> Film:
+        """Adds iterations to a film until one of the settings' limits is reached; at least one.
+
+        The time limit is that of this call: a new film's first look at the scene, learning, filtering and denoising
+        are in it. SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and
         `film.interrupted` is the number of the signal.
 
         Args:
             film: A film from `new_film`, to be continued; None: a new one.
             progress: Called after every iteration.
+            started: `time.perf_counter` from which the time counts, before uploading for example; None: this call.
+            reserve: Time of the limit that the caller needs after this call, for writing the picture for example [s].
         """
+        start = time.perf_counter() if started is None else started
         film = film or self.new_film()
-        start = time.perf_counter() - film.seconds
+        start -= film.seconds
         with cancel_on_signal(self.launcher, film):
+            film.seconds = time.perf_counter() - start
             scheduler = AdaptiveScheduler(film, self.settings, self._is_adaptive())
             profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
@@ -159,11 +185,9 @@ class Renderer:
                 try:
                     self.add_iteration(film, film.iterations)
                     film.seconds = time.perf_counter() - start
-                    spent = profile.since(before)
-                    per_ray = spent["primary"] / (profile.counts["primary_rays"] - rays)
-                    report = scheduler.update(
-                        reserve=self._picture_seconds(film, per_ray), fixed_share=spent["emission"] / spent.total()
-                    )
+                    spent, samples = profile.since(before), profile.counts["primary_rays"] - rays
+                    picture = self._picture_seconds(film, spent["primary"] / samples, spent["film"] / samples)
+                    report = scheduler.update(reserve=reserve + picture, fixed_share=spent["emission"] / spent.total())
                 except Cancelled:
                     break
                 if progress is not None:
@@ -194,7 +218,7 @@ class Renderer:
             raise InputError(f"scene: shutter has {len(scene.shutter)} samples, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
         uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
-        self._shutter = []
+        self._shutter, self._origin = [], object()
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
@@ -225,11 +249,12 @@ class Renderer:
         limited = settings.time_limit is not None or settings.target_error is not None
         return limited and settings.iterations is None and settings.filter and len(self._shutter) == 1
 
-    def _picture_seconds(self, film: Film, per_ray: float) -> float:
-        """Estimated time to make the picture [s], if a camera ray takes `per_ray` [s]."""
+    def _picture_seconds(self, film: Film, per_ray: float, per_addition: float) -> float:
+        """Estimated time to make the picture [s], if a camera ray and adding a sample to the film take as long [s]."""
         seconds = 0.0
         if film.reconstruction is not None:
-            seconds += per_ray * film.width * film.height * film.reconstruction.passes(film.iterations)
+            rays, additions = film.reconstruction.cost(film.iterations)
+            seconds += film.width * film.height * (rays * per_ray + additions * per_addition)
         if self.settings.denoise:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
@@ -289,7 +314,7 @@ def render(
     device: str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Film:
-    """Renders a scene until one of the settings' limits is reached.
+    """Renders a scene until one of the settings' limits is reached; the time limit is that of the whole call.
 
     SIGINT (Ctrl-C) and SIGTERM end it early: the film then holds the iterations done so far, and `film.interrupted` is
     the number of the signal.
@@ -303,5 +328,6 @@ def render(
     Raises:
         InputError: The scene, the settings or the device cannot be used; the message says why in one line.
     """
-    renderer = Renderer(scene, settings or RenderSettings(**scene.settings), device=device)
-    return renderer.render(progress=progress)
+    started = time.perf_counter()
+    renderer = Renderer(scene, settings, device=device)
+    return renderer.render(progress=progress, started=started)

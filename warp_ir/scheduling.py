@@ -71,12 +71,15 @@ class AdaptiveScheduler:
         max_tiles = (_TIME_MARGIN * left - per_iteration) / per_tile
         does_not_fit = self._adaptive and per_iteration + per_tile * film.chosen.sum() > left
         measure_error = _is_error_due(film.iterations)
+        if self._settings.target_error is not None and film.iterations.bit_count() == 1:
+            film.measure_noise()  # makes the picture after 1, 2, 4, ... iterations
         if does_not_fit or measure_error:
             squares = film.squared_errors()
-            if measure_error and math.sqrt(squares.sum()) <= (self._settings.target_error or 0.0):
-                squares = film.squared_errors(filtered=True)  # expensive: it makes the picture
             if measure_error:
-                self._error = 1.0 if film.is_unlit() else math.sqrt(squares.sum())
+                errors = film.filtered_errors(squares)
+                if math.sqrt(errors.sum()) <= (self._settings.target_error or 0.0):
+                    squares = errors = film.squared_errors(filtered=True)  # expensive: it makes the picture
+                self._error = 1.0 if film.is_unlit() else math.sqrt(errors.sum())
             if self._adaptive:
                 film.choose(select_tiles(squares, film.tile_iterations, max_tiles))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())

@@ -40,7 +40,11 @@ class RenderSettings:
     depth_of_field: bool = _setting(True, "blur what is out of focus, if the camera has an f-stop")
     motion_blur: bool = _setting(True, "blur what moves while the camera's shutter is open")
     iterations: int | None = _setting(None, "stop after this many iterations (64 if no other limit is given)")
-    time_limit: float | None = _setting(None, "stop after this many seconds of rendering")
+    time_limit: float | None = _setting(
+        None,
+        "stop after this many seconds, from the call (of the command: from its start) to the picture, whatever they are"
+        " spent on; one iteration is the least",
+    )
     target_error: float | None = _setting(
         None,
         "stop when the estimated relative RMS error of the picture, noise and the filter's bias, is below this; the"

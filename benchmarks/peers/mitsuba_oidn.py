@@ -51,6 +51,13 @@ class MitsubaDenoised:
         picture = _denoise(run.picture, *guides)
         return Run(picture, time.perf_counter() - begin, run.samples)
 
+    def render_samples(self, count: int, seed: int) -> Run:
+        """Renders a denoised picture of a number of samples per pixel and measures the CPU time."""
+        begin = time.process_time()
+        guides = self._guides(1, seed)
+        picture = _denoise(self._paths.render_samples(count, seed).picture, *guides)
+        return Run(picture, time.process_time() - begin, count)
+
     def _guides(self, samples: int, seed: int) -> tuple[Pixels, Pixels]:
         """Albedo and shading normals, float32 [height, width, 3]."""
         layers = np.array(self._mi.render(self._surfaces, integrator=self._aovs, spp=samples, seed=seed))

@@ -83,6 +83,13 @@ class MitsubaPath:
         picture = self._picture(probe.integrator, samples, seed)
         return Run(picture, time.perf_counter() - begin, samples)
 
+    def render_samples(self, count: int, seed: int) -> Run:
+        """Renders a number of samples per pixel and measures the CPU time."""
+        probe = min(self._probes, key=lambda probe: probe.error)
+        begin = time.process_time()
+        picture = self._picture(probe.integrator, count, seed)
+        return Run(picture, time.process_time() - begin, count)
+
     def _probe(self, kind: str, task: Task) -> Probe:
         """Measures cost and error of an integrator after compilation."""
         emissive = any(max(material.emission) > 0.0 for material in task.scene.materials)

@@ -28,6 +28,19 @@ def test_radiance_is_emission_over_absorption(estimator, shape, albedo, device):
 
 
 @pytest.mark.extended
+def test_paths_that_carry_much_do_not_end(device):
+    """At ρ = 1/2 roulette begins with the third reflection after the first, and then takes every other path.
+
+    Its variance is that of β(1 + N), β = 1/4, N geometric of ratio 1/2: 2 β² = 1/8 of (ρ Le)², and as much again is
+    allowed for the choice of emitter and direction. Roulette by ρ from the first reflection on has 2 (ρ Le)².
+    """
+    film = render(furnace(0.5, level=3), "path", device, iterations=256)
+    variance = np.mean(film.standard_error().astype(np.float64) ** 2) * film.iterations
+    assert variance < 2.0 * 0.125 * 0.5**2
+    assert_mean(film, 2.0)
+
+
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("absorption", ["fractional", "roulette"])
 @pytest.mark.parametrize("bounces", [0, 1, 3])

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,7 +21,11 @@ from typing import NoReturn
 
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import say
+from warp_ir.image.io import check_input
 from warp_ir.scene import InputError
+
+_LOADED = time.perf_counter()
+"""When the command began, if it is the process's: Python itself has taken some hundredths of a second before."""
 
 
 class Terminated(BaseException):
@@ -32,7 +37,7 @@ def command() -> NoReturn:
 
     `os._exit` skips the destructors of all objects of Warp, NumPy and USD, which would take half a second.
     """
-    code = main()
+    code = main(started=_LOADED)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):  # the stream is missing, closed or broken
@@ -40,14 +45,16 @@ def command() -> NoReturn:
     os._exit(code)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, started: float | None = None) -> int:
     """Runs the command line and returns the exit code.
 
     Args:
         argv: The arguments; None: those of the process.
+        started: `time.perf_counter` from which `--time-limit` counts; None: this call.
     """
+    started = time.perf_counter() if started is None else started
     argv = sys.argv[1:] if argv is None else list(argv)
-    verbose = "--verbose" in argv
+    verbose = "--verbose" in argv or "-v" in argv
     # A file name that the terminal cannot encode must not raise an error.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -55,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     previous_handler = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
         args = parse(argv)
+        check_input(args.stage, "a USD file")  # before anything is imported that takes time
+        args.started = started
         code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
         sys.stdout.flush()
         return code

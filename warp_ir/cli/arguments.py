@@ -24,6 +24,8 @@ _PICTURE_ONLY = {
     *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space", "filter", "denoise"),
 }
 """Settings that affect the picture but not the light paths: `warp-ir vpls` has no flags for them."""
+VPL_DRAWING = ("view", "color_by", "bounces", "min_contribution", "paths", "order")
+"""Flags of `warp-ir vpls` that only a drawing has; None if they are not given."""
 _SHORT = {"width": ("-w",)}
 _OUTPUT = (
     "picture to write; ### is replaced by the frame number. Or a folder: every picture that the stage's RenderProducts"
@@ -47,7 +49,7 @@ _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
 The extension of OUTPUT chooses the format. .exr (colour, alpha, AOV layers,
-metadata), .hdr, .pfm and .npy hold linear radiance; .png and .jpg are
+metadata), .hdr, .pfm and .npy hold linear radiance; .png, .jpg and .tif are
 tone-mapped. Ctrl-C stops the render and writes the picture so far.
 
 examples:
@@ -73,8 +75,13 @@ examples:
   warp-ir vpls room.usda cloud.png
   # points to view in usdview
   warp-ir vpls room.usda cloud.usda --light-paths 256
-  # NumPy arrays: positions, normals, intensity, bounce, directional
+  # NumPy arrays: positions, normals, intensity, bounce, path, parent, ...
   warp-ir vpls room.usda cloud.npz --iteration 3
+  # a page for a browser: which VPLs light the pixel in column 100, row 80
+  warp-ir vpls room.usda pixel.html --contribution-to 100,80 --paths \\
+      --color-by contribution
+  # lights with which any renderer can light the scene
+  warp-ir vpls room.usda lights.usda --as-lights
 """
 _COMPARE_NOTES = """\
 relMSE is the mean of (x - r)^2 / (r^2 + 0.01 m^2), where x is the picture, r
@@ -121,7 +128,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     for name, summary, notes, fill in (
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
         ("info", "show what a stage contains, what will be skipped, and why", "", _add_info),
-        ("vpls", "write the virtual point lights as a picture, USD points or arrays", _VPLS_NOTES, _add_vpls),
+        ("vpls", "write the virtual point lights as a picture, page, model, USD or arrays", _VPLS_NOTES, _add_vpls),
         ("compare", "measure error against time of each method and recommend one", _COMPARE_NOTES, _add_compare),
     ):
         command = commands.add_parser(
@@ -136,8 +143,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         fill(command)
         messages = command.add_argument_group("messages")
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
-        messages.add_argument("--verbose", action="store_true", help="print all warnings, and tracebacks of errors")
-    return parser.parse_args(_join_aov_names(argv))
+        more = "print all warnings, and tracebacks of errors"
+        messages.add_argument("--verbose", "-v", action="store_true", help=more)
+    args, unknown = parser.parse_known_args(_join_aov_names(argv))
+    if unknown:  # argparse itself would name the help of all commands
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
+    return args
 
 
 def _join_aov_names(argv: Sequence[str]) -> list[str]:
@@ -213,13 +224,13 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
         metavar="NAME ...",
         help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files next to it",
     )
-    stops = "brightness of .png and .jpg: each stop doubles the radiance (default: 0)"
+    stops = "brightness of .png, .jpg and .tif: each stop doubles the radiance (default: 0)"
     output.add_argument("--exposure", type=_stops, default=0.0, metavar="STOPS", help=stops)
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
         default=TONEMAPS[0],
-        help="tone curve of .png and .jpg: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
+        help="tone curve of these files: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
@@ -231,6 +242,8 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
     _add_device(output)
+    threads = "CPU threads (default: one for each core); the picture does not depend on it"
+    output.add_argument("--threads", type=_count, metavar="N", help=threads)
 
 
 def _add_info(parser: argparse.ArgumentParser) -> None:
@@ -242,15 +255,29 @@ def _add_info(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_vpls(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("output", metavar="OUTPUT", help=".png picture, .usda points, or .npz arrays")
+    output = ".png picture, .html page, .gltf model, .usda points or lights, .npz arrays, .gif or .mp4 animation"
+    parser.add_argument("output", metavar="OUTPUT", help=output)
     paths = parser.add_argument_group("light paths")
     _add_settings(paths, [name for name in _FIELDS if name not in _PICTURE_ONLY])
     number = "number of the iteration whose light paths are traced (default: 0)"
     paths.add_argument("--iteration", type=int, default=0, metavar="N", help=number)
-    view = "where the picture is taken from: the stage's camera, or outside the scene (default: outside)"
-    paths.add_argument("--view", choices=("camera", "outside"), default="outside", help=view)
+    target = "also compute what each VPL contributes: to a pixel, column and row of the image, or to the whole picture"
+    paths.add_argument("--contribution-to", type=_pixel_or_picture, metavar="X,Y|picture", help=target)
+    paths.add_argument("--as-lights", action="store_true", help="write UsdLux lights to .usda, not points")
     paths.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     _add_device(paths)
+    drawing = parser.add_argument_group("drawing (not for .usda and .npz)")
+    view = "where the scene is seen from: the stage's camera, or outside (default: outside)"
+    drawing.add_argument("--view", choices=("camera", "outside"), help=view)
+    coloring = "what the colour of a VPL shows (default: hue, the colour of its light)"
+    drawing.add_argument("--color-by", choices=("hue", "flux", "bounce", "contribution"), help=coloring)
+    chosen = "only VPLs after these numbers of reflections; 0 is on the lights (default: all)"
+    drawing.add_argument("--bounces", type=_whole_numbers, metavar="N[,N]", help=chosen)
+    least = "only VPLs with at least this fraction of the greatest contribution (default: 0)"
+    drawing.add_argument("--min-contribution", type=_fraction, metavar="FRACTION", help=least)
+    drawing.add_argument("--paths", action="store_true", default=None, help="also draw the light paths")
+    order = "how an animation adds the VPLs (default: path)"
+    drawing.add_argument("--order", choices=("path", "bounce"), help=order)
     _add_stage(parser, frames=False)
 
 
@@ -324,7 +351,7 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     group.add_argument("--renderPassPrimPath", dest="render_pass", help=hidden)
     group.add_argument(
         "--purposes",
-        type=_names(_PURPOSES),
+        type=_names(_PURPOSES, spaces=True),
         metavar="NAME[,NAME]",
         help="purposes to draw in addition to 'default': render, proxy, guide (default: those of the RenderSettings,"
         " or render)",
@@ -383,11 +410,11 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _names(known: Collection[str]) -> Callable[[str], list[str]]:
-    """A parser of argument values that are names separated by commas."""
+def _names(known: Collection[str], *, spaces: bool = False) -> Callable[[str], list[str]]:
+    """A parser of argument values that are names separated by commas, or with `spaces` also by blanks."""
 
     def names(text: str) -> list[str]:
-        given = [name.strip() for name in text.split(",") if name.strip()]
+        given = text.replace(",", " ").split() if spaces else [part.strip() for part in text.split(",") if part.strip()]
         for name in given:
             if name not in known:
                 raise argparse.ArgumentTypeError(f"unknown {name!r}; known are {', '.join(known)}")
@@ -432,6 +459,28 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text[:9]) <= 1000:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, is {text!r}")
     return int(text)
+
+
+def _whole_numbers(text: str) -> list[int]:
+    if not re.fullmatch(r"\d{1,6}(,\d{1,6})*", text):
+        raise argparse.ArgumentTypeError(f"must be whole numbers separated by commas, is {text!r}")
+    return [int(number) for number in text.split(",")]
+
+
+def _pixel_or_picture(text: str) -> "tuple[int, int] | str":
+    if text == "picture":
+        return text
+    numbers = _whole_numbers(text) if re.fullmatch(r"\d+,\d+", text) else []
+    if len(numbers) != 2:
+        raise argparse.ArgumentTypeError(f"must be 'picture', or column and row such as 100,80, is {text!r}")
+    return numbers[0], numbers[1]
+
+
+def _fraction(text: str) -> float:
+    value = _finite(text)
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"must be from 0 to 1, is {text.strip()}")
+    return value
 
 
 def _stops(text: str) -> float:

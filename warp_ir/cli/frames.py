@@ -23,12 +23,15 @@ def outputs_of(output: str, frames: str | None, time: TimeCode) -> dict[TimeCode
         time: Time code of a single picture.
 
     Raises:
-        InputError: The frames cannot be parsed, or the placeholder is missing or has too few decimals.
+        InputError: The frames cannot be parsed, the placeholder is missing or has too few decimals, or there is one and
+            no frames are given.
     """
+    placeholders = re.findall(r"#+(?:\.#+)?", output)
     if frames is None:
+        if any(len(placeholder) > 1 for placeholder in placeholders):  # a single # may be part of a name
+            raise InputError(f"{output}: {placeholders[-1]} is the place of a frame number, which needs --frames")
         return {time: Path(output)}
     codes = time_codes(frames)
-    placeholders = re.findall(r"#+(?:\.#+)?", output)
     if len(placeholders) != 1:
         raise InputError(f"--frames: the output needs one placeholder such as ### for the frame: {output}")
     width, digits = len(placeholders[0]), len(placeholders[0].partition(".")[2])

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 _EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
 """Words of the warnings of a scene that explain a black picture."""
+_WRITE_SECONDS = 0.05, 2.5e-7
+"""Approximate time to load what writes pictures, and to write a pixel [s]; a later picture: as the last one."""
 _IN_SURFACE = 1e-6
 """Depth in units of the scene's size below which a camera lies in the surface that it sees."""
 
@@ -59,13 +61,14 @@ class _Job:
     reader: "StageReader"
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
+    write_seconds: float | None = None
+    """Time in which the latest picture was written [s]."""
     warned: set[str] = field(default_factory=set)
     """Warnings that have been printed."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Renders the stage's picture, or one for each frame and product; returns the exit code."""
-    begin = time.perf_counter()
     # All errors of the command line are reported before anything is loaded.
     settings_of(args)
     pictures = []
@@ -81,23 +84,25 @@ def run(args: argparse.Namespace) -> int:
     with importing():
         _ = ir.load_usd, ir.Renderer  # imported here, so that the first frame's time does not include it
     versions = _versions()
-    imported = time.perf_counter() - begin
+    imported = time.perf_counter() - args.started
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
-    opened = time.perf_counter() - begin - imported
+    opened = time.perf_counter() - args.started - imported
     job = _Job(args, device, versions, reader)
     if into_folder:
         pictures = _products(job)
 
     frames: list[dict[str, Any]] = []
     code = 0
+    started: float = args.started
     for number, picture in enumerate(pictures, start=1):
         path = next(iter(picture.files))
         if args.resume and all(file.exists() for file in picture.files) and not checkpoint_path(path).exists():
             say(f"{path}: exists and is skipped")
             continue
         label = path.name if len(pictures) == 1 else f"{path.name} ({number}/{len(pictures)})"
-        statistics, code = _render_picture(job, picture, label)
+        statistics, code = _render_picture(job, picture, label, started)
+        started = time.perf_counter()
         if not frames:
             statistics["timings"]["load"] += opened
         frames.append(statistics)
@@ -149,8 +154,8 @@ def _products(job: _Job) -> list[_Picture]:
     return pictures
 
 
-def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str, Any], int]:
-    """Loads, renders and writes one picture; returns its statistics and the exit code."""
+def _render_picture(job: _Job, picture: _Picture, label: str, started: float) -> tuple[dict[str, Any], int]:
+    """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code."""
     args = job.args
     path = next(iter(picture.files))
     with ProgressDisplay(label, quiet=args.quiet) as display:
@@ -169,7 +174,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
         else:
-            job.renderer = ir.Renderer(scene, settings, device=job.device)
+            job.renderer = ir.Renderer(scene, settings, device=job.device, threads=job.args.threads)
         renderer, film = job.renderer, job.renderer.new_film()
         checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint)
         if args.resume and checkpoint.resume():
@@ -180,8 +185,11 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
             if progress.fraction < 1.0:
                 checkpoint.write_if_due()
 
-        renderer.render(film, report)
-    timings = {**film.timings, "load": load_seconds}
+        begin = time.perf_counter()
+        reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
+        renderer.render(film, report, started=started, reserve=reserve)
+        render_seconds = time.perf_counter() - begin
+    timings = {**film.timings, "load": load_seconds, "render": render_seconds}
     # `Film.interrupted` is the number of the signal.
     stop_signal = int(film.interrupted)
     code = 128 + stop_signal if stop_signal else 0
@@ -211,6 +219,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
                 )
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
+        job.write_seconds = timings["write"]
     if not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
@@ -219,6 +228,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str) -> tuple[dict[str,
     explained = any(words in line for line in scene.warnings for words in _EXPLANATIONS)
     picture_warnings = [*([f"{scene.camera.name}: {blank}"] if blank and not explained else []), *write_warnings]
     picture_warnings += renderer.warnings
+    if settings.time_limit is not None and film.iterations == 1 and film.seconds > settings.time_limit:
+        late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
+        picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
     if not args.quiet:
         say_warnings(picture_warnings)
     _summarize(job, path, film, written=bool(written), blank=bool(blank))
@@ -258,6 +270,8 @@ def _blank_picture(scene: Scene, film: "Film") -> str:
     size = max(scene.extent, float(abs(scene.camera.world_from_camera[:3, 3]).max()))
     if hit.all() and film.aov("depth").max() <= _IN_SURFACE * size:
         return "the camera lies in a surface: the picture is black"
+    if not film.aov("albedo").any():
+        return "the surfaces that the camera sees reflect nothing: the picture is black"
     return "no light reaches what the camera sees, from outside a closed room for example: the picture is black"
 
 
@@ -292,7 +306,7 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     )
     if film.rejected:
         say(f"warning: {film.rejected} non-finite samples were replaced")
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
             brightness = "dark" if stops > job.args.exposure else "bright"

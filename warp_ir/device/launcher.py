@@ -61,7 +61,10 @@ class _Launch:
 
 
 class Launcher:
-    """Runs kernels on one device, and times them by phase. Only one thread may call it; it uses others internally."""
+    """Runs kernels on one device, and times them by phase.
+
+    It uses threads internally. Of the threads that call it, one at a time may: the one that holds `exclusive`.
+    """
 
     def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
         """Opens the device.
@@ -83,6 +86,8 @@ class Launcher:
         """Whether a launch has finished when the call returns: then the host reads results without waiting."""
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+        self.exclusive = threading.RLock()
+        """Held by whoever launches kernels, or works on buffers that iterations and pictures share."""
         self._lock = threading.Lock()
         self._loader: ThreadPoolExecutor | None = None
         self._loading: dict[Any, Future[Any]] = {}  # by Warp's module

@@ -110,7 +110,7 @@ def coarse_meshes(scene: Scene, frame: DeviceFrame) -> tuple[str, ...]:
 
     A triangle is as precise as its own coordinates: an end far away makes it coarse everywhere.
     """
-    instanced = {k for group in scene.instances for k in group.meshes}
+    instanced = scene.instanced()
     names: list[str] = []
     for k, mesh in enumerate(scene.meshes):
         if k in instanced or not len(mesh.triangles):

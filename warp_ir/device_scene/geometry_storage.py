@@ -205,7 +205,7 @@ _Units = dict[_UnitKey, tuple[Mesh, ...]]
 
 def _movable_units(scene: Scene, mesh_indices: Sequence[int]) -> _Units:
     """The units that may move independently: each mesh of the world, each prototype; without empty meshes, in order."""
-    instanced = {k for group in scene.instances for k in group.meshes}
+    instanced = scene.instanced()
     members: list[tuple[bool, bool, tuple[int, ...]]] = []
     members += [(False, False, (k,)) for k in range(len(scene.meshes)) if k not in instanced]
     members += [(True, group.colors is not None, group.meshes) for group in scene.instances]

@@ -33,27 +33,11 @@ from warp_ir.lights import light_visibility
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.settings import ResolvedSettings
 from warp_ir.tiles import indices
+from warp_ir.vpl.contribution import geometry_term
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
-
-
-@wp.func
-def geometry_term(
-    position: wp.vec3, normal: wp.vec3, shading_normal: wp.vec3, vpl_position: wp.vec4, vpl_normal: wp.vec4
-) -> float:
-    """G between a surface point and a VPL; for a directional VPL (w = 0), the cosine at the point."""
-    xyz = wp.vec3(vpl_position[0], vpl_position[1], vpl_position[2])
-    to_vpl = xyz - position * vpl_position[3]
-    squared = wp.dot(to_vpl, to_vpl)
-    direction = to_vpl / wp.sqrt(squared)
-    if wp.dot(normal, direction) <= 0.0:
-        return 0.0  # behind the surface, even where the shading normal faces the VPL
-    at_point = wp.max(0.0, wp.dot(shading_normal, direction))
-    vpl_facing = wp.vec3(vpl_normal[0], vpl_normal[1], vpl_normal[2])
-    at_vpl = wp.max(0.0, vpl_normal[3] - wp.dot(vpl_facing, direction))
-    return at_point * at_vpl / squared
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)

@@ -1,8 +1,8 @@
 """Path tracing, the independent second opinion: one path per pixel and iteration, from the camera.
 
 At every vertex one light is sampled (next-event estimation), and the direction in which the path continues may hit an
-emitter as well; multiple importance sampling weighs the two by the power heuristic (Veach 1997). Paths end by Russian
-roulette on the local albedo.
+emitter as well; multiple importance sampling weighs the two by the power heuristic (Veach 1997). Paths that carry less
+than a quarter of what they began with end by Russian roulette.
 
 Camera paths hardly ever hit the spot that a small light makes on a wall next to it, and their noise does not tell.
 Where a path's last segments, next to the light, are all less than a quarter of the segment before them, light paths
@@ -60,6 +60,7 @@ from warp_ir.tiles import indices
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _MAX_SURVIVAL = wp.constant(0.999)
+_ROULETTE_THROUGHPUT = wp.constant(0.25)  # paths that carry more go on: ending them would cost more noise than time
 _SPOT_DISTANCE = wp.constant(4.0)  # least distance to a spot, in lengths of the longest segment from the light to it
 _SPOT_STREAM = wp.constant(wp.uint32(0x3C6EF372))  # decorrelates the light paths of spots from the camera paths
 _SMALL = 1.0 / 32.0
@@ -202,10 +203,11 @@ def _trace_paths(
         if bounce > max_bounces or hit.triangle < 0 or not above:
             break
         rho = albedo(scene, hit, scene.footprint)
-        survival = wp.min(wp.max(rho), _MAX_SURVIVAL)
+        throughput = wp.cw_mul(throughput, rho) * geometry_term_of_hit(x, direction, hit)[1]
+        survival = wp.min(wp.max(throughput) / _ROULETTE_THROUGHPUT, _MAX_SURVIVAL)
         if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
             break
-        throughput = wp.cw_mul(throughput, rho) / survival * geometry_term_of_hit(x, direction, hit)[1]
+        throughput = throughput / survival
         if has_spots == 1:
             length = wp.length(hit.position - x.position)
             spot_distance = wp.max(length, wp.where(spot_distance > _SPOT_DISTANCE * length, spot_distance, 0.0))

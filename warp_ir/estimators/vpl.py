@@ -61,23 +61,6 @@ class GatherSettings:
     max_bounces: int
 
 
-@wp.func
-def _spread(x: int) -> int:
-    """The lowest sixteen bits of x, with a zero after each: one coordinate of a Morton code."""
-    y = (x | (x << 8)) & 0x00FF00FF
-    y = (y | (y << 4)) & 0x0F0F0F0F
-    y = (y | (y << 2)) & 0x33333333
-    return (y | (y << 1)) & 0x55555555
-
-
-@wp.func
-def _sequence_index(settings: GatherSettings, columns: int, pixel: int) -> int:
-    """The pixel's place on the Z-order curve, along which the sequence is stratified in squares of 2^k x 2^k pixels."""
-    column = (settings.first_column + pixel % columns) & 0xFFFF
-    row = (settings.first_row + pixel // columns) & 0xFFFF
-    return _spread(column) | (_spread(row) << 1)
-
-
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _gather_pixels(
     first: int,
@@ -92,7 +75,10 @@ def _gather_pixels(
         return
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    index = _sequence_index(settings, gbuffer.tiles.columns, pixel)
+    # The index depends on the pixel's place in the image, not on the film: a crop has the same pixels.
+    column = settings.first_column + pixel % gbuffer.tiles.columns
+    row = settings.first_row + pixel // gbuffer.tiles.columns
+    index = sobol.index_of_pixel(column, row, settings.scramble)
     # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
     u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
     x = camera_vertex(gbuffer, pixel)

@@ -1,8 +1,13 @@
 """The film: a mean, a standard deviation and a count per pixel. Iterations are added, films are merged."""
 
+import base64
+import functools
 import math
 import os
-from typing import Any, Protocol, Self
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +18,10 @@ from warp_ir.device_scene import DeviceFrame
 from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, new_film_data
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
-from warp_ir.film.storage import FilmState, read_arrays, read_state, reconstruction_names, write_film
+from warp_ir.film.picture_noise import PictureNoise, tile_sums
+from warp_ir.film.storage import FilmState, read_arrays, read_noise, read_state, reconstruction_names, write_film
 from warp_ir.gbuffer import GBuffer
+from warp_ir.image.io import write_image
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import TILE, Tiles, all_tiles, some_tiles, tile_count
@@ -29,6 +36,21 @@ _CLEAN_ITERATIONS = 8
 """Iterations from which the mean albedo and normals have less noise than a denoiser would leave in them."""
 
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def _exclusive(method: "Callable[Concatenate[Film, _P], _R]") -> "Callable[Concatenate[Film, _P], _R]":
+    """A method of `Film` that no other thread disturbs: the film does not change meanwhile, nor do shared buffers."""
+
+    @functools.wraps(method)
+    def alone(film: "Film", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with film._launcher.exclusive:
+            return method(film, *args, **kwargs)
+
+    return alone
+
+
 class PictureFilter(Protocol):
     """What a film requires of the `Reconstruction` that filters its picture."""
 
@@ -41,8 +63,8 @@ class PictureFilter(Protocol):
     def merge(self, other: Self) -> None:
         """Adds the samples of another film's filter."""
 
-    def passes(self, iterations: int) -> float:
-        """Cost of `resolve`, in passes of camera rays through all pixels."""
+    def cost(self, iterations: int) -> tuple[float, float]:
+        """Cost of `resolve` for each pixel, in camera rays and in samples added to the film."""
 
     def resolve(self, film: FilmData, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
         """Direct and indirect radiance, [2, height, width, 3]; with `features` [5, ...], see `Reconstruction`."""
@@ -83,7 +105,7 @@ class Film:
         self.iterations = 0
         """Iterations added; tiles that were not chosen have fewer (`tile_iterations`)."""
         self.seconds = 0.0
-        """Wall time of rendering the iterations [s], without loading and compiling."""
+        """Wall time since the call that rendered it, up to the picture [s]: `render` uploads within this time."""
         self.interrupted = 0
         """Number of the signal that ended the render before its limit; 0: none."""
         self.settings: RenderSettings | None = None
@@ -94,10 +116,13 @@ class Film:
         """Numbers of rays, VPLs and others over all iterations."""
         self.reconstruction: PictureFilter | None = None
         """The filter of the picture; None: the picture is the unfiltered mean."""
+        self.origin: object = None
+        """The renderer's upload of the scene to which its iterations belong; None: it was made without a renderer."""
         self.emits = False
         """Whether anything in the scene emits: then no surface need be black."""
         self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them
         self._denoised: tuple[int, Image] | None = None
+        self._noise: PictureNoise | None = None
         self._frame = frame or DeviceFrame(np.zeros(3), 1.0)
         self._launcher = launcher
         self._data = new_film_data(width * height, has_emission, sees_lights, launcher)
@@ -131,6 +156,7 @@ class Film:
             self._skipped += ~self.chosen
             self.tiles.skipped = self._launcher.array(self._skipped, wp.int32)
 
+    @_exclusive
     def merge(self, other: "Film") -> None:
         """Adds another film of the same picture, which must come from other iterations or another seed.
 
@@ -162,11 +188,13 @@ class Film:
             array.assign(mine)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
+        self._noise = None  # it is of one sequence of iterations
         self.iterations += other.iterations
         self._skipped += other._skipped
         self.choose(self.chosen)
         self.seconds += other.seconds
 
+    @_exclusive
     def radiance(self) -> npt.NDArray[np.float32]:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
@@ -204,6 +232,7 @@ class Film:
             self._resolved = (self.iterations, reconstruction.resolve(self._data, self.iterations, features))
         return self._resolved[1]
 
+    @_exclusive
     def standard_error(self) -> npt.NDArray[np.float32]:
         """Standard error of `radiance` per pixel, float32 [height, width, 3]: √(se² + b²).
 
@@ -229,12 +258,14 @@ class Film:
             error = np.hypot(error, difference * pixels)
         return np.where(n > 1, error, np.float32(np.inf))
 
+    @_exclusive
     def error(self) -> float:
         """Estimated relative RMS error of the picture: √ of the mean of (se² + b²) / (L² + 0.01 m²).
 
         se and b are those of `standard_error`, m is the mean of the radiance L. With a filter the picture is made for
-        it, unless it has been made. Where L is uncertain, the denominator moves towards the smaller median of its
-        neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
+        it, unless it has been made. Where `measure_noise` has seen three pictures, se is the noise that the filter
+        leaves, with an allowance for its bias. Where L is uncertain, the denominator moves towards the smaller median
+        of its neighbours: a pixel that is bright by chance has an error larger than its brightness suggests.
 
         1 if the scene emits and none of that light has reached a surface in view: what the samples have missed is
         unknown. NaN with fewer than two iterations.
@@ -245,12 +276,14 @@ class Film:
             return 1.0
         return math.sqrt(self.squared_errors(filtered=True).sum())
 
+    @_exclusive
     def is_unlit(self) -> bool:
         """Whether the camera sees surfaces that reflect, and no iteration has found any light on them."""
         if not self.emits or not (self._data.albedo.numpy() > 0.0).any():
             return False
         return not (self._data.direct.numpy().any() or self._data.indirect.numpy().any())
 
+    @_exclusive
     def squared_errors(self, *, filtered: bool = False) -> npt.NDArray[np.float64]:
         """Contribution of every tile of 8 x 8 pixels to the square of `error`, [tiles], row by row.
 
@@ -260,7 +293,41 @@ class Film:
         if filtered and self.reconstruction is not None and self.iterations > 1:
             difference = self._filter_difference(self.reconstruction)
         _, error, noise, change = self._tile_errors(difference).T
-        return np.asarray((error + np.maximum(change - noise, 0.0)) / (3 * self.width * self.height))
+        error, bias = (x / (3 * self.width * self.height) for x in (error, np.maximum(change - noise, 0.0)))
+        return np.asarray(self.filtered_errors(error) + bias if filtered else error)
+
+    def measure_noise(self) -> None:
+        """Makes the filtered picture, and compares it with the last one for which this was called.
+
+        To be called at powers of two of the iterations. From the third picture on, `error` tells what the filter gains.
+        """
+        if self.reconstruction is None:
+            return
+        picture = np.asarray(self._reconstruct(self.reconstruction)[:2].sum(axis=0))
+        iterations = self.tile_iterations
+        self._noise = (
+            PictureNoise.first(picture, iterations) if self._noise is None else self._noise.updated(picture, iterations)
+        )
+
+    def filtered_errors(self, plain: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """`squared_errors` of the filtered picture as far as it is known without making it, from those of the mean.
+
+        The mean's are taken if they are smaller, and where emission is in view: the first camera rays on an edge are
+        those of the last picture, so that its error changes little.
+        """
+        if self._noise is None:
+            return plain
+        errors = self._noise.squared_errors(self.tile_iterations) / (3 * self.width * self.height)
+        emissive = tile_sums(self._near_emission()[..., None].astype(np.float64)) > 0.0
+        errors = np.where(emissive, plain, errors)
+        return errors if errors.sum() < plain.sum() else plain  # NaN: not known yet
+
+    def _near_emission(self) -> npt.NDArray[np.bool_]:
+        """Pixels [height, width] that see emission, and their neighbours."""
+        emissive = np.pad(self._radiance_of("emission").max(axis=-1) > 0.0, 1)
+        for axis in (0, 1):
+            emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
+        return np.asarray(emissive[1:-1, 1:-1])
 
     def _tile_errors(self, filter_difference: Image | None) -> npt.NDArray[np.float64]:
         """Sums of `tile_errors` over every tile, relative to L² + 0.01 m²."""
@@ -274,11 +341,9 @@ class Film:
         There the picture is made of more camera rays than the mean, so that the difference is no bias.
         """
         difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*_RADIANCE))
-        emissive = np.pad(self._radiance_of("emission").max(axis=-1) > 0.0, 1)
-        for axis in (0, 1):
-            emissive = emissive | np.roll(emissive, 1, axis) | np.roll(emissive, -1, axis)
-        return np.where(emissive[1:-1, 1:-1, None], np.float32(0.0), difference)
+        return np.where(self._near_emission()[..., None], np.float32(0.0), difference)
 
+    @_exclusive
     def aov(self, name: str) -> npt.NDArray[Any]:
         """One of `AOV_NAMES`, row 0 at the top.
 
@@ -331,6 +396,17 @@ class Film:
         """Number of samples that were not finite and count as black; 0 unless something is wrong."""
         return int(self._data.rejected.numpy().sum())
 
+    def _repr_html_(self) -> str:
+        """How notebooks show a film: the picture, what it took, and its error."""
+        caption = f"{self.width} x {self.height}, {self.iterations} iterations in {self.seconds:.1f} s"
+        if self.iterations > 1:
+            caption += f", estimated error {100.0 * self.error():.2g} %"
+        with tempfile.TemporaryDirectory() as folder:
+            (picture,) = write_image(Path(folder) / "film.png", self)
+            data = base64.b64encode(picture.read_bytes()).decode("ascii")
+        return f'<img src="data:image/png;base64,{data}" alt="{caption}"><br>{caption}'
+
+    @_exclusive
     def save(self, path: str | os.PathLike[str], key: str = "") -> None:
         """Writes the film and the samples of its filter as .npz; `load` and `resume` restore it bit for bit.
 
@@ -339,7 +415,7 @@ class Film:
             key: Identifies the scene and the settings; `resume` compares it.
         """
         state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame)
-        write_film(path, state, self._saved_arrays())
+        write_film(path, state, self._saved_arrays(), self._noise)
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
         """Restores a film that `save` wrote into this one, which must be empty and of the same scene.
@@ -355,6 +431,7 @@ class Film:
         if any(stored[name].shape[0] != array.shape[0] for name, array in arrays.items()):
             raise InputError(f"{os.fspath(path)}: not a film: its arrays differ in size")
         self._restore(state, arrays, stored)
+        self._noise = read_noise(path)
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":

@@ -1,6 +1,6 @@
 """Reading and writing pictures; a file is written completely or not at all.
 
-`.exr`, `.hdr`, `.pfm` and `.npy` hold linear radiance, `.png` and `.jpg` tone-mapped display values.
+`.exr`, `.hdr`, `.pfm` and `.npy` hold linear radiance, `.png`, `.jpg` and `.tif` tone-mapped display values.
 """
 
 import os
@@ -35,7 +35,7 @@ AOV_CHANNELS = {
 }
 """Channels of an EXR file that hold the AOVs of a film; its radiance is in R, G and B."""
 
-SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg")
+SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
 """Extensions of the pictures that can be written."""
 
 _HALF_MAX = 65504.0
@@ -91,12 +91,12 @@ def write_image(
     """Writes a picture in the format of the file's extension.
 
     Args:
-        path: `.exr` (colour, alpha, AOVs, metadata), `.hdr`, `.pfm`, `.npy` (linear), `.png` or `.jpg` (tone-mapped).
-            An existing file is replaced.
+        path: `.exr` (colour, alpha, AOVs, metadata), `.hdr`, `.pfm`, `.npy` (linear), `.png`, `.jpg` or `.tif`
+            (tone-mapped). An existing file is replaced.
         source: A film, or an array [h, w], [h, w, 1], [h, w, 3] or [h, w, 4] (colour premultiplied by alpha) in
             linear Rec. 709, row 0 at the top.
-        exposure: Exposure [stops]; for `.png` and `.jpg` only.
-        tonemap: "srgb" or "filmic"; for `.png` and `.jpg` only.
+        exposure: Exposure [stops]; for `.png`, `.jpg` and `.tif` only.
+        tonemap: "srgb" or "filmic"; for `.png`, `.jpg` and `.tif` only.
         aov: Name of the film's AOV to write in place of its radiance.
         aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
             to a file of its own: picture.NAME.png for picture.png.
@@ -179,6 +179,22 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
 def aov_path(path: Path, aov: str) -> Path:
     """Path of an AOV of `path` in a format without layers: a.png -> a.depth.png."""
     return path.with_name(f"{path.stem}.{aov}{path.suffix}")
+
+
+def check_input(path: str | os.PathLike[str], kind: str) -> None:
+    """Checks that a file can be read, as far as that costs no time.
+
+    Args:
+        path: The file.
+        kind: What it should be, such as "a USD file".
+
+    Raises:
+        InputError: There is no such file, or it is a folder.
+    """
+    if not os.path.exists(path):
+        raise InputError(f"{os.fspath(path)}: no such file")
+    if os.path.isdir(path):
+        raise InputError(f"{os.fspath(path)}: is a directory, not {kind}")
 
 
 def check_output(
@@ -356,17 +372,20 @@ def _write_single_layer(
             values = np.maximum(np.broadcast_to(values, (*values.shape[:2], 3)), 0.0)
         _save(path, oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], oiio.FLOAT), values)
         return
-    if suffix == ".png" and alpha is not None:
-        # PNG stores unassociated alpha. JPEG has no alpha: premultiplied colour is the picture over black.
+    keeps_alpha = alpha is not None and suffix in (".png", ".tif", ".tiff")
+    if keeps_alpha and alpha is not None:
+        # Stored unassociated. JPEG has no alpha: premultiplied colour is the picture over black.
         values = np.divide(values, alpha, out=np.zeros_like(values), where=alpha > 0.0)
     shown = _display(values, aov, exposure, tonemap)
-    if suffix == ".png" and alpha is not None:
+    if keeps_alpha and alpha is not None:
         shown = np.concatenate([shown, np.clip(alpha, 0.0, 1.0)], axis=-1)
-    pixels = np.floor(shown * 255.0 + 0.5).astype(np.uint8)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
+    steps, stored = (65535.0, np.uint16) if suffix in (".tif", ".tiff") else (255.0, np.uint8)
+    pixels = np.floor(shown * steps + 0.5).astype(stored)
+    kind = oiio.UINT16 if stored == np.uint16 else oiio.UINT8
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.set_colorspace("sRGB")
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("Compression", "zip" if suffix == ".png" else "jpeg:95")
+    spec.attribute("Compression", "jpeg:95" if suffix in (".jpg", ".jpeg") else "zip")
     _save(path, spec, pixels)
 
 
@@ -386,7 +405,7 @@ def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> A
     return shown
 
 
-def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.uint8]") -> None:
+def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.integer]") -> None:
     """Writes pixels with OpenImageIO; raises `InputError` if that fails in any way."""
     import OpenImageIO as oiio
 

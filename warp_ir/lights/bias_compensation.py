@@ -3,12 +3,11 @@
 import warp as wp
 
 from warp_ir.device_scene import SceneData
-from warp_ir.lights.intersect import modified_emission
+from warp_ir.lights.intersect import meet_light, modified_emission, shaped_radiance
 from warp_ir.lights.shape import (
     intersect_shape,
     is_large,
     large_light_pdf,
-    meets_before,
     modifier_row_of_light,
     modifier_row_of_surface,
     shape_radiance,
@@ -17,9 +16,7 @@ from warp_ir.lights.visibility import (
     CROSSINGS,
     continue_behind,
     light_visibility,
-    may_intersect,
     only_sampled,
-    shaping_at,
 )
 from warp_ir.surface import Hit, ShadingPoint, closest, emission, scene_at, shadow_ray_origin
 
@@ -93,17 +90,11 @@ def _clamped_light_radiance(
         shape = int(0)
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
-            hit = intersect_shape(scene, light, origin, direction)
-            if meets_before(scene, light, origin, direction, hit, t_max) and may_intersect(
-                scene, modifier_row_of_light(scene, light), x.mesh, 0.0
-            ):
+            hit = meet_light(scene, light, origin, direction, t_max, 0.0, x.mesh)
+            if hit[3] > 0.0:
                 fraction = _light_clamped_fraction(scene, light, hit, origin, direction, cosine, bound)
                 if fraction > 0.0:
-                    radiance = shape_radiance(scene, light, origin, direction, hit[3])
-                    total += (
-                        wp.cw_mul(radiance, shaping_at(scene, modifier_row_of_light(scene, light), -direction))
-                        * fraction
-                    )
+                    total += shaped_radiance(scene, light, origin, direction, hit[3]) * fraction
     # This loop is apart from the query above, since two simultaneous traversals would share a stack on CUDA.
     for k in range(scene.only_sampled_count):
         light = scene.light_tables[0].modifiers.only_sampled_lights[k]

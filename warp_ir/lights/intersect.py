@@ -40,6 +40,26 @@ def intersect_lights(
     return wp.vec3(0.0)
 
 
+@wp.func
+def meet_light(
+    scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t_max: float, bsdf_pdf: float, mesh: int
+) -> wp.vec4:
+    """`intersect_shape` of a light that is linked to a mesh, before a surface at t_max; arguments as above."""
+    hit = intersect_shape(scene, light, origin, direction)
+    if meets_before(scene, light, origin, direction, hit, t_max) and may_intersect(
+        scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf
+    ):
+        return hit
+    return wp.vec4(0.0, 0.0, 0.0, -1.0)
+
+
+@wp.func
+def shaped_radiance(scene: SceneData, light: int, origin: wp.vec3, direction: wp.vec3, t: float) -> wp.vec3:
+    """Radiance of a light with an area where a ray meets it at t."""
+    radiance = shape_radiance(scene, light, origin, direction, t)
+    return wp.cw_mul(radiance, shaping_at(scene, modifier_row_of_light(scene, light), -direction))
+
+
 @wp.func(inline=False)
 def _intersect_lights(
     address: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float, escapes: bool, bsdf_pdf: float, mesh: int
@@ -52,12 +72,9 @@ def _intersect_lights(
         shape = int(0)
         while wp.bvh_query_next(query, shape, t_max):
             light = scene.shape_light[shape]
-            hit = intersect_shape(scene, light, origin, direction)
-            if meets_before(scene, light, origin, direction, hit, t_max) and may_intersect(
-                scene, modifier_row_of_light(scene, light), mesh, bsdf_pdf
-            ):
-                radiance = shape_radiance(scene, light, origin, direction, hit[3])
-                radiance = wp.cw_mul(radiance, shaping_at(scene, modifier_row_of_light(scene, light), -direction))
+            hit = meet_light(scene, light, origin, direction, t_max, bsdf_pdf, mesh)
+            if hit[3] > 0.0:
+                radiance = shaped_radiance(scene, light, origin, direction, hit[3])
                 if bsdf_pdf >= 0.0:
                     radiance = radiance * mis_weight(bsdf_pdf, shape_pdf(scene, light, origin, direction, hit[3]))
                 total += radiance

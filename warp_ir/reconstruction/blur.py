@@ -14,11 +14,12 @@ from warp_ir.film.accumulate import FilmData
 from warp_ir.gbuffer import CameraHit, camera_ray, jitter, lens_point, project, surface_point_of, trace_camera_ray
 from warp_ir.reconstruction.compose import (
     ResolvedPicture,
-    ResolvedPixel,
+    UnassignedIrradiance,
     edge_rays,
     filtered_estimate,
     store_pixel,
     supersampled_estimate,
+    unassigned_irradiance,
     unfiltered_estimate,
 )
 from warp_ir.reconstruction.edges import (
@@ -29,7 +30,7 @@ from warp_ir.reconstruction.edges import (
     mean_over_rays,
     on_edge,
 )
-from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel, mean_channels
+from warp_ir.reconstruction.filter import IrradianceLayer, mean_channel
 from warp_ir.reconstruction.pixel_surfaces import MIN_MATCH, match_weight
 from warp_ir.reconstruction.reprojection import ShutterData, reproject_to_reference
 from warp_ir.reconstruction.sample_buffer import SampleBuffer
@@ -53,44 +54,6 @@ class _BlurredPixel:
     pixel: SupersampledPixel
     blurred: int  # 1: some rays hit points that the pixel's centre does not stand for
     mixed: int  # 1: the rays differ in albedo, emission or irradiance
-
-
-@wp.struct
-class _UnassignedIrradiance:
-    """Irradiance of surfaces that no pixel centre shows."""
-
-    irradiance: WeightedIrradiance
-    is_measured: int  # 1: from unassigned samples nearby; 0: from the pixel's mean
-
-
-@wp.func
-def _unassigned_irradiance(
-    samples: SampleBuffer, p: int, unfiltered: ResolvedPixel, exposure: float
-) -> _UnassignedIrradiance:
-    """Mean of the unassigned samples in the 5 x 5 neighbourhood or, without any, of all samples of the pixel."""
-    surfaces = samples.surfaces
-    irradiance = WeightedIrradiance()
-    for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            x = p % surfaces.columns + dx
-            y = p // surfaces.columns + dy
-            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
-                q = y * surfaces.columns + x
-                w = 1.0 / (1.0 + float(dx * dx + dy * dy))
-                irradiance.direct += w * samples.unassigned_direct[q]
-                irradiance.indirect += w * samples.unassigned_indirect[q]
-                irradiance.weight += w * float(samples.unassigned_count[q])
-    out = _UnassignedIrradiance()
-    out.is_measured = wp.where(irradiance.weight > 0.0, 1, 0)
-    if out.is_measured == 0:
-        irradiance.weight = 1.0
-        albedo = wp.max(unfiltered.albedo, wp.vec3(1.0e-6))
-        irradiance.direct = wp.cw_div(unfiltered.direct / exposure, albedo)
-        irradiance.indirect = wp.cw_div(unfiltered.indirect / exposure, albedo)
-    means = mean_channels(irradiance.direct, irradiance.indirect)
-    irradiance.variance = wp.cw_mul(means, means) / irradiance.weight
-    out.irradiance = irradiance
-    return out
 
 
 @wp.func
@@ -124,7 +87,7 @@ def _supersample_blur(
     samples: SampleBuffer,
     layer: IrradianceLayer,
     p: int,
-    unassigned: _UnassignedIrradiance,
+    unassigned: UnassignedIrradiance,
     ray_counts: wp.vec2i,
     mixed: bool,
 ) -> _BlurredPixel:
@@ -209,7 +172,7 @@ def _compose_blurred(
     p = first + wp.tid()
     x = unfiltered_estimate(film, p, out.scale)
     out.edge_residual.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    unassigned = _unassigned_irradiance(samples, p, x, exposure)
+    unassigned = unassigned_irradiance(samples, p, x, exposure)
     edge = on_edge(samples.surfaces, film, p)
     ray_counts = wp.vec2i(film.count[p], out.max_rays)
     supersampled = _supersample_blur(shutter, samples, layer, p, unassigned, ray_counts, edge)

@@ -121,21 +121,47 @@ def store_pixel(out: ResolvedPicture, p: int, x: ResolvedPixel) -> None:
     out.rows[1, p] = x.indirect
 
 
+@wp.struct
+class UnassignedIrradiance:
+    """Irradiance of surfaces that no pixel centre shows."""
+
+    irradiance: WeightedIrradiance
+    is_measured: int  # 1: from unassigned samples nearby; 0: from the pixel's mean
+
+
 @wp.func
-def _unassigned_irradiance(
+def unassigned_irradiance(
     samples: SampleBuffer, p: int, unfiltered: ResolvedPixel, exposure: float
-) -> WeightedIrradiance:
-    """Irradiance of surfaces that no pixel centre shows: of the pixel's unassigned samples or, without, of all."""
-    out = WeightedIrradiance()
-    out.weight = float(samples.unassigned_count[p])
-    out.direct = samples.unassigned_direct[p]
-    out.indirect = samples.unassigned_indirect[p]
-    if samples.unassigned_count[p] == 0:
-        out.weight = exposure
-        out.direct = wp.cw_div(unfiltered.direct, wp.max(unfiltered.albedo, wp.vec3(1.0e-6)))
-        out.indirect = wp.cw_div(unfiltered.indirect, wp.max(unfiltered.albedo, wp.vec3(1.0e-6)))
-    means = mean_channels(out.direct, out.indirect)
-    out.variance = wp.cw_mul(means, means) / out.weight
+) -> UnassignedIrradiance:
+    """Mean of the unassigned samples in the 5 x 5 neighbourhood or, without any, of all samples of the pixel.
+
+    Such surfaces are narrow or lie in crevices: few samples of a pixel hit them, and the others are brighter. The more
+    the pixel has of its own, the less its neighbours count.
+    """
+    surfaces = samples.surfaces
+    irradiance = WeightedIrradiance()
+    own_count = float(1 + samples.unassigned_count[p])
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            x = p % surfaces.columns + dx
+            y = p // surfaces.columns + dy
+            if x >= 0 and y >= 0 and x < surfaces.columns and y < surfaces.rows:
+                q = y * surfaces.columns + x
+                distance_squared = float(dx * dx + dy * dy)
+                w = 1.0 / (1.0 + own_count * distance_squared * distance_squared)
+                irradiance.direct += w * samples.unassigned_direct[q]
+                irradiance.indirect += w * samples.unassigned_indirect[q]
+                irradiance.weight += w * float(samples.unassigned_count[q])
+    out = UnassignedIrradiance()
+    out.is_measured = wp.where(irradiance.weight > 0.0, 1, 0)
+    if out.is_measured == 0:
+        irradiance.weight = 1.0
+        albedo = wp.max(unfiltered.albedo, wp.vec3(1.0e-6))
+        irradiance.direct = wp.cw_div(unfiltered.direct / exposure, albedo)
+        irradiance.indirect = wp.cw_div(unfiltered.indirect / exposure, albedo)
+    means = mean_channels(irradiance.direct, irradiance.indirect)
+    irradiance.variance = wp.cw_mul(means, means) / irradiance.weight
+    out.irradiance = irradiance
     return out
 
 
@@ -157,7 +183,7 @@ def _compose(
     x = unfiltered
     out.edge_residual.direct[p] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     if samples.count[p] != film.count[p] or on_edge(surfaces, film, p):
-        unassigned = _unassigned_irradiance(samples, p, unfiltered, exposure)
+        unassigned = unassigned_irradiance(samples, p, unfiltered, exposure).irradiance
         ray_counts = wp.vec2i(film.count[p], out.max_rays)
         pixel = supersample_edge(scene, camera, samples, layer, p, unassigned, ray_counts)
         x = supersampled_estimate(unfiltered, film, pixel, p, exposure, out)

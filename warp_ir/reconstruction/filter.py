@@ -58,12 +58,11 @@ def _tap_weight(k: int) -> float:
 def _similarity(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
     """Weight in [0, 1] of two values, by their difference in units of their noise; the same for (b, a).
 
-    Noise is the harmonic mean of both variances. By that of `a` alone the picture would darken: what is dim by chance
-    has little noise, and would take nothing from what is bright.
+    Noise is the mean of both variances. By that of `a` alone the picture would darken: what is dim by chance has little
+    noise, and would take nothing from what is bright. By the smaller one an outlier would keep all its light.
     """
     d = (a[0] + a[1] + a[2] - b[0] - b[1] - b[2]) * (1.0 / 3.0)
-    variance = a[3] * (b[3] / (a[3] + b[3] + 1.0e-30))
-    t = 1.0 + d * d / (4.0 * sigma * sigma * variance + 1.0e-30)
+    t = 1.0 + d * d / (sigma * sigma * (a[3] + b[3]) + 1.0e-30)
     return 1.0 / (t * t)
 
 

@@ -25,8 +25,8 @@ from warp_ir.reconstruction.reprojection import (
 )
 from warp_ir.reconstruction.sample_buffer import accumulate, estimate_means, new_sample_buffer, sample_sums
 
-_FILTER_PASSES = 6.0
-"""Approximate cost of the filter, in passes of camera rays through all pixels; less where rays are expensive."""
+_FILTER_ADDITIONS = 10.0
+"""Approximate cost of the filter, in samples added to the film for each pixel: both stream through memory."""
 _LAYER_TYPES = (wp.vec4, wp.vec4, wp.vec4, wp.vec4, wp.vec2)
 """Two `IrradianceLayer`, and the variance of the samples."""
 SCRATCH = float_count(*_LAYER_TYPES)
@@ -90,12 +90,12 @@ class Reconstruction:
         for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())
 
-    def passes(self, iterations: int) -> float:
-        """Approximate cost of `resolve`, in passes of camera rays through all pixels."""
+    def cost(self, iterations: int) -> tuple[float, float]:
+        """Approximate cost of `resolve` for each pixel, in camera rays and in samples added to the film."""
         if self._shutter is not None:
-            return _FILTER_PASSES + blur_rays(iterations)
-        # About half of the pixels next to an edge show one surface, and need few rays.
-        return _FILTER_PASSES + 0.5 * self._edge_share * edge_rays(iterations)
+            return blur_rays(iterations), _FILTER_ADDITIONS
+        # About half of the pixels next to an edge show one surface, and need few rays, which are less coherent.
+        return 0.6 * self._edge_share * edge_rays(iterations), _FILTER_ADDITIONS
 
     def resolve(self, film: FilmData, iterations: int, features: bool = False) -> npt.NDArray[np.float32]:
         """Makes the picture.

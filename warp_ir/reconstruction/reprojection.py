@@ -197,7 +197,8 @@ def _estimate_missing_variance(first: int, samples: SampleBuffer) -> None:
 def surfaces_move(scenes: Sequence[DeviceScene]) -> bool:
     """Whether any surface moves between the shutter samples."""
     first = scenes[0]
-    places = [[id(group.matrices) for group in s.stored.instances] for s in scenes]
+    # What does not move is the same memory, of which every record has a view of its own.
+    places = [[group.matrices.ctypes.data for group in s.stored.instances] for s in scenes]
     return any(s.first_triangles != first.first_triangles for s in scenes) or any(p != places[0] for p in places)
 
 

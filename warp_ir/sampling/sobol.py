@@ -47,6 +47,8 @@ _MASK_1 = wp.constant(wp.uint32(0x55555555))
 _MASK_2 = wp.constant(wp.uint32(0x33333333))
 _MASK_4 = wp.constant(wp.uint32(0x0F0F0F0F))
 _MASK_8 = wp.constant(wp.uint32(0x00FF00FF))
+_PIXEL_ORDER = wp.constant(wp.uint32(0xBB67AE85))  # the stream of `index_of_pixel`
+_PIXEL_LEVELS = wp.constant(6)  # blocks of 64 x 64 pixels: points of larger indices take longer to compute
 
 
 def sobol_matrices() -> npt.NDArray[np.uint32]:
@@ -144,6 +146,43 @@ def _permutation_seed(scramble: wp.uint32, stream: wp.uint32) -> wp.uint32:
     coordinates of a point.
     """
     return hash_combine(hash_combine(scramble, stream), scramble)
+
+
+@wp.func
+def _spread(x: wp.uint32) -> wp.uint32:
+    """The lowest sixteen bits of x, with a zero after each: one coordinate of a Morton code."""
+    y = x & wp.uint32(0xFFFF)
+    y = (y | (y << wp.uint32(8))) & _MASK_8
+    y = (y | (y << wp.uint32(4))) & _MASK_4
+    y = (y | (y << wp.uint32(2))) & _MASK_2
+    return (y | (y << wp.uint32(1))) & _MASK_1
+
+
+@wp.func
+def index_of_pixel(column: int, row: int, scramble: wp.uint32) -> int:
+    """The index of the point of the sequence that a pixel of the image uses: its place on a shuffled Z-order curve.
+
+    Aligned squares of 2^k x 2^k pixels use aligned runs of 4^k points, which are stratified, so noise is blue. Every
+    square visits its quadrants in an order of its own, one of 24, chosen by a hash (Ahmed and Wonka 2020,
+    "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of pixels"): along the
+    plain Z-order curve all squares are alike, and noise is a weave. Blocks of 64 x 64 pixels use the same points.
+    """
+    code = _spread(wp.uint32(column)) | (_spread(wp.uint32(row)) << wp.uint32(1))
+    seed = _permutation_seed(scramble, _PIXEL_ORDER)
+    index = wp.uint32(0)
+    for level in range(_PIXEL_LEVELS):
+        shift = wp.uint32(2 * level)
+        bits = hash_combine(seed + wp.uint32(level), code >> (shift + wp.uint32(2)))
+        # The permutations of four are the affine maps of two binary digits: two different columns of three, an offset.
+        column_1 = (bits >> wp.uint32(16)) % wp.uint32(3)
+        column_2 = (column_1 + wp.uint32(1) + ((bits >> wp.uint32(2)) & wp.uint32(1))) % wp.uint32(3)
+        quadrant = bits & wp.uint32(3)
+        if ((code >> shift) & wp.uint32(1)) != wp.uint32(0):
+            quadrant = quadrant ^ (column_1 + wp.uint32(1))
+        if ((code >> shift) & wp.uint32(2)) != wp.uint32(0):
+            quadrant = quadrant ^ (column_2 + wp.uint32(1))
+        index = index | (quadrant << shift)
+    return int(index)
 
 
 @wp.func

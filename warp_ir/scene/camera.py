@@ -7,7 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from warp_ir.scene.types import Floats, InputError
+from warp_ir.scene.types import Floats, InputError, keep_read_only
 
 CONFORM_POLICIES = (
     "expandAperture",
@@ -51,6 +51,9 @@ class Camera:
     clipping_planes: tuple[tuple[float, float, float, float], ...] = ()
     """At most `MAX_CLIPPING_PLANES` planes (a, b, c, d) in the camera's space: camera rays hit only surfaces where
     a x + b y + c z + d >= 0."""
+
+    def __post_init__(self) -> None:
+        keep_read_only(self, f"camera {self.name!r}", ("world_from_camera",))
 
     @property
     def aspect(self) -> float:

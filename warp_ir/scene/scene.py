@@ -132,6 +132,10 @@ class Scene:
                 remaining.append(replace(group, meshes=rest))
         return replace(self, meshes=tuple(flat), instances=tuple(remaining))
 
+    def instanced(self) -> set[int]:
+        """Indices of the meshes that are prototypes of `instances`, and drawn by these alone."""
+        return {k for group in self.instances for k in group.meshes}
+
     def _mesh_groups(self) -> list[tuple[Mesh, Instances | None]]:
         """Every mesh and the `Instances` that it is part of, or None."""
         groups = {k: group for group in self.instances for k in group.meshes}

@@ -5,9 +5,10 @@ the stage, on which light transport does not depend. Matrices act on column vect
 are float64, so that a scene far from the origin keeps its detail until it is uploaded.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,31 @@ MAX_RADIANCE = 1e30
 
 class InputError(ValueError):
     """The user's input cannot be rendered; the message is one line that names what is wrong and where."""
+
+
+def keep_read_only(record: object, label: str, names: Sequence[str]) -> None:
+    """Replaces arrays of a frozen record by views that cannot be written to: changes would have no effect.
+
+    The arrays that they view stay as they are, writable for whoever made them.
+
+    Args:
+        record: The record.
+        label: What messages call it.
+        names: Fields that are arrays, or None.
+
+    Raises:
+        InputError: A field is something else.
+    """
+    for name in names:
+        value = getattr(record, name)
+        if value is None:
+            continue
+        if not isinstance(value, np.ndarray):
+            raise InputError(f"{label}: {name} must be a NumPy array, is of type {type(value).__name__}")
+        if value.flags.writeable:
+            view = value.view()
+            view.flags.writeable = False
+            object.__setattr__(record, name, view)
 
 
 class LightKind(IntEnum):
@@ -63,7 +89,10 @@ class Texture:
     transform: Floats = field(default_factory=lambda: np.eye(2, 3))
     """float64 [2, 3]: (s, t) = transform (u, v, 1). (0, 0) is the image's lower left corner, (1, 1) its upper right."""
 
-    @property
+    def __post_init__(self) -> None:
+        keep_read_only(self, f"texture {self.name!r}", ("pixels", "transform"))
+
+    @cached_property
     def mean(self) -> Color:
         """Mean of the pixels; an image of one channel is grey."""
         red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
@@ -137,6 +166,9 @@ class Shaping:
     """Photometric profile (IES), [rows, columns]: factors at the centres of cells. Rows divide θ from 0° to 180°,
     columns the azimuth from 0° to 360°, counted from the light's +X towards its +Y; interpolated in between."""
 
+    def __post_init__(self) -> None:
+        keep_read_only(self, "shaping", ("profile",))
+
 
 @dataclass(frozen=True, eq=False)
 class MeshLight:
@@ -154,6 +186,9 @@ class MeshLight:
     """Defined like `Light.unlit`."""
     shadowless: frozenset[int] = frozenset()
     """Defined like `Light.shadowless`."""
+
+    def __post_init__(self) -> None:
+        keep_read_only(self, f"light {self.name!r}", ("world_from_light",))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +223,10 @@ class Mesh:
     """Shaping, light linking and shadows of its emission; None: it emits in all directions, lights all meshes, and all
     meshes cast shadows in its light."""
 
+    def __post_init__(self) -> None:
+        names = ("points", "triangles", "material", "normals", "colors", "bare", "tangents")
+        keep_read_only(self, f"mesh {self.name!r}", names)
+
 
 @dataclass(frozen=True, eq=False)
 class Instances:
@@ -201,6 +240,9 @@ class Instances:
     """world_from_prototype, float64 [k, 4, 4], invertible; they may mirror and shear."""
     colors: Floats | None = None
     """float32 [k, 3], albedo per instance of the triangles that `Mesh.bare` selects; None: their material's."""
+
+    def __post_init__(self) -> None:
+        keep_read_only(self, f"instances {self.name!r}", ("matrices", "colors"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,3 +276,6 @@ class Light:
     """Indices of the `Scene.meshes` that it does not illuminate (light linking)."""
     shadowless: frozenset[int] = frozenset()
     """Indices of the `Scene.meshes` that cast no shadow in its light (shadow linking)."""
+
+    def __post_init__(self) -> None:
+        keep_read_only(self, f"light {self.name!r}", ("world_from_light", "texture"))

@@ -61,7 +61,7 @@ def _surface_around_eye(scene: Scene) -> Mesh | None:
     in_box = ((lower - slack <= eye) & (eye <= upper + slack)).all()
     if scene.camera.projection != Projection.PERSPECTIVE or scene.camera.clipping[0] > slack or not in_box:
         return None
-    instanced = {k for group in scene.instances for k in group.meshes}
+    instanced = scene.instanced()
     for k, mesh in enumerate(scene.meshes):
         if k not in instanced and _touches(mesh, eye, slack):
             return mesh
@@ -102,7 +102,7 @@ def _emitters_facing_away(scene: Scene) -> list[Mesh]:
         return []
     emits = np.array([max(m.emission) > 0.0 for m in scene.materials], bool)
     opaque = np.array([m.opacity >= 1.0 and m.opacity_texture is None for m in scene.materials], bool)
-    instanced = {k for group in scene.instances for k in group.meshes}
+    instanced = scene.instanced()
     eye = scene.camera.world_from_camera[:3, 3]
     enclosing = []
     for k, mesh in enumerate(scene.meshes):

@@ -10,6 +10,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from warp_ir.scene import Floats, Ints
+from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
 
 _RENDERED = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -147,11 +148,12 @@ class Skinning:
             inbetween, blend_shape = shapes.GetInbetween(subshape), shapes.GetBlendShape(shape)
             if not blend_shape:
                 raise Unreadable(f"blend shape {shape} does not exist")
-            normals = inbetween.GetNormalOffsets() if inbetween else blend_shape.GetNormalOffsetsAttr().Get()
+            of_normals = inbetween.GetNormalOffsetsAttr() if inbetween else blend_shape.GetNormalOffsetsAttr()
+            normals = read.floats(of_normals, Usd.TimeCode.Default(), 3)
             for target, values in ((points, offsets[subshape]), (normal_offsets, normals)):
-                offset = np.asarray(values if values is not None else [], dtype=np.float64).reshape(-1, 3)
-                if len(offset) == 0:
+                if values is None or not len(values):
                     continue
+                offset = np.asarray(values, dtype=np.float64)
                 index = authored if len(authored) else np.arange(len(points))
                 if len(index) != len(offset) or index.min() < 0 or index.max() >= len(points):
                     raise Unreadable(f"blend shape {shape} has {len(offset)} offsets that do not fit the points")

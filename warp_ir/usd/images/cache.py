@@ -31,6 +31,7 @@ class ImageCache:
         self.report = report
         self.default_wrap = default_wrap
         self._images: dict[tuple[str, str], Image | str] = {}
+        self._values: dict[Hashable, ShadingValue] = {}
         self._textures: dict[Hashable, Texture] = {}
         self._pixels_left = MAX_TEXTURE_PIXELS
 
@@ -62,6 +63,10 @@ class ImageCache:
         if isinstance(cached, str):
             raise Unreadable(cached)
         return cached
+
+    def shared(self, value: ShadingValue) -> ShadingValue:
+        """The first mapped value that is equal to this one, so that its mean and its range are computed once."""
+        return self._values.setdefault((value.key, value.mapping), value)
 
     def texture(self, value: ShadingValue) -> Texture:
         """A mapped value as a texture; equal values give the same object."""

@@ -7,6 +7,7 @@ of images with different mappings, all but the first are replaced by their means
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -55,10 +56,20 @@ class ShadingValue:
     function: Callable[[PrimvarValues], Floats] | None = None
     """The value as a function of primvars, images replaced by their means; None: independent of primvars."""
 
-    @property
+    @cached_property
     def mean(self) -> Floats:
         """Mean over the pixels, float64 [c]."""
         return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
+
+    @cached_property
+    def lowest(self) -> float:
+        """Minimum over the pixels and their channels."""
+        return float(self.pixels.min())
+
+    @cached_property
+    def highest(self) -> float:
+        """Maximum over the pixels and their channels."""
+        return float(self.pixels.max())
 
     def evaluate(self, primvars: PrimvarValues) -> Floats:
         """The value on a surface with these primvars, [c] or [m, 3, c]."""
@@ -117,8 +128,8 @@ def combine(label: Hashable, function: Callable[..., npt.ArrayLike], *values: Sh
 
 def _finite(values: npt.ArrayLike) -> Floats:
     """The values with NaN replaced by 0 and infinities by ±3e38: authored arithmetic may overflow."""
-    finite: Floats = np.nan_to_num(np.asarray(values), nan=0.0, posinf=3.0e38, neginf=-3.0e38)
-    return finite
+    array: Floats = np.asarray(values)
+    return array if np.isfinite(array).all() else np.nan_to_num(array, nan=0.0, posinf=3.0e38, neginf=-3.0e38)
 
 
 def select(value: ShadingValue, channels: list[int]) -> ShadingValue:

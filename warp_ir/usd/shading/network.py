@@ -148,7 +148,8 @@ class ShadingNetwork:
         _, pixels, key, tiles = self._images.look_up(
             attribute, self._time, space, np.resize(outside, 4), channels, self.warn
         )
-        return ShadingValue(pixels, outside, mapping(tiles), (key, tuple(channels)), self._asset_path(attribute))
+        key = (key, tuple(channels), tuple(outside))
+        return self._images.shared(ShadingValue(pixels, outside, mapping(tiles), key, self._asset_path(attribute)))
 
     def _input(self, shader_input: UsdShade.Input, default: ShadingValue, depth: int) -> ShadingValue:
         """The value of an input: authored, or of the node that is connected to it."""
@@ -276,8 +277,9 @@ class ShadingNetwork:
         uv, transform = self._texture_coordinates(node.GetInput("st"), _MAX_DEPTH, unconnected=_constant_uv(0.0, 0.0))
         mapping = _place(uv, transform, (wraps[0], wraps[1]), tiles)
         outside = fallback if tiles != (1, 1) else np.zeros(4)  # wrap mode black is transparent black
-        key = (key, tuple(channels))
+        key = (key, tuple(channels), tuple(outside[channels]))
         value = ShadingValue(pixels, outside[channels], mapping, key, self._asset_path(attribute))
+        value = self._images.shared(value)
         if (scale[channels] == 1.0).all() and (bias[channels] == 0.0).all():
             return value
         label = ("scale", tuple(scale[channels]), tuple(bias[channels]))

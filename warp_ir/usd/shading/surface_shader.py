@@ -170,7 +170,7 @@ class _NetworkInputs:
     def tangent_normal(self, name: str, value: ShadingValue) -> ShadingValue | None:
         """A normal map from values in tangent space; None: it is flat."""
         self.warn_primvar_fallbacks(name, value)
-        if np.abs(value.pixels).max() > 1.0:
+        if max(-value.lowest, value.highest) > 1.0:
             value = combine("normal", lambda n: np.clip(n, -1.0, 1.0), value)
         x, y, z = value.mean.tolist()
         if value.mapping is None:
@@ -194,7 +194,7 @@ class _NetworkInputs:
     def warn_unrendered_lobe(self, name: str, what: str) -> None:
         """Warns of a lobe that is not rendered, if its weight is not 0."""
         weight = self.scalar(name, 0.0)
-        if weight.pixels.max() > 0.0 or weight.primvars:
+        if weight.highest > 0.0 or weight.primvars:
             self.warn(f"{what} is not rendered ({{n}} materials)")
 
     def number(self, name: str, default: float) -> float:
@@ -214,15 +214,15 @@ def _preview_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     albedo = inputs.color("diffuseColor", _GREY)
     if inputs.number("useSpecularWorkflow", 0.0) > 0.5:
         specular = combine("clip", _clamp01, inputs.color("specularColor", _BLACK))
-        if specular.pixels.max() > 0.0:
+        if specular.highest > 0.0:
             albedo = combine("specular", lambda d, s: d * (1.0 - s) + s, albedo, specular)
-        if specular.pixels.max() > 0.05:
+        if specular.highest > 0.05:
             inputs.warn("specular reflection is rendered as diffuse ({n} materials)")
     else:
         albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 0.0), albedo)
     emission = inputs.color("emissiveColor", _BLACK)
     opacity, threshold = inputs.scalar("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
-    if threshold <= 0.0 and inputs.token("opacityMode") != "presence" and emission.pixels.max() > 0.0:
+    if threshold <= 0.0 and inputs.token("opacityMode") != "presence" and emission.highest > 0.0:
         # In mode `transparent` opacity does not dim emission, but the renderer reduces the emission by it.
         emission = combine("glow", lambda e, o: e / np.clip(o, _MIN_OPACITY, 1.0), emission, opacity)
     return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
@@ -301,7 +301,7 @@ def _weighted(color: ShadingValue, weight: ShadingValue) -> ShadingValue:
 
 def _metal_as_diffuse(inputs: _NetworkInputs, metallic: ShadingValue, albedo: ShadingValue) -> ShadingValue:
     """The albedo where the surface is a metal: its base colour, or 0 if metals are black."""
-    if metallic.pixels.max() <= 0.0 and not metallic.primvars:
+    if metallic.highest <= 0.0 and not metallic.primvars:
         return albedo
     if not inputs.black_metals:
         inputs.warn("metal is rendered as a diffuse surface of its base colour ({n} materials)")
@@ -318,7 +318,7 @@ def _scattering(
     Metals do not scatter.
     """
     weight_value = inputs.scalar(weight, 0.0)
-    if weight_value.pixels.max() <= 0.0 and not weight_value.primvars:
+    if weight_value.highest <= 0.0 and not weight_value.primvars:
         return albedo
     inputs.warn("subsurface scattering is rendered as diffuse reflection ({n} materials)")
 
@@ -333,10 +333,10 @@ def _scattering(
 def _tinted_by_coat(inputs: _NetworkInputs, weight: str, albedo: ShadingValue) -> ShadingValue:
     """The albedo below a coat, whose colour filters the reflection: coloured lacquer on metal, for example."""
     coat = inputs.scalar(weight, 0.0)
-    if coat.pixels.max() <= 0.0 and not coat.primvars:
+    if coat.highest <= 0.0 and not coat.primvars:
         return albedo
     tint = inputs.color("coat_color", _WHITE)
-    if tint.pixels.min() >= 1.0 and not tint.primvars:
+    if tint.lowest >= 1.0 and not tint.primvars:
         return albedo
     return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _clamp01(t))), albedo, coat, tint)
 
@@ -350,13 +350,13 @@ def _evaluated(
     normal: ShadingValue | None,
 ) -> EvaluatedMaterial | None:
     """The evaluated material with an albedo in [0, 1] and a non-negative emission; None: opacity is 0."""
-    if albedo.pixels.min() < 0.0 or albedo.pixels.max() > 1.0:
+    if albedo.lowest < 0.0 or albedo.highest > 1.0:
         inputs.warn(f"albedo {_value_text(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _clamp01, albedo)
-    if float(emission.pixels.max()) >= MAX_RADIANCE:
+    if emission.highest >= MAX_RADIANCE:
         inputs.warn(f"emission {_value_text(emission)} exceeds {MAX_RADIANCE:g}; it emits nothing")
         emission = constant(*_BLACK)
-    if emission.pixels.min() < 0.0:
+    if emission.lowest < 0.0:
         inputs.warn(f"negative emission {_value_text(emission)} clamped to 0")
         emission = combine("positive", lambda e: np.clip(e, 0.0, math.inf), emission)
     opacity = combine("clip", _clamp01, opacity)
@@ -373,17 +373,19 @@ def _evaluated(
     inputs.warn_unrendered_input("displacement")
     network = inputs.network
     textured = opacity.mapping is not None and not opaque
+    emissive_image = emission.mapping is not None and emission.highest > 0.0
+    albedo_texture = None if albedo.mapping is None else network.texture(_with_bounded_border(albedo))
+    emission_texture = network.texture(_with_bounded_border(emission)) if emissive_image else None
+    opacity_texture = network.texture(_with_bounded_border(opacity)) if textured else None
     material = Material(
         str(network.material),
-        _rgb(albedo.mean),
-        _rgb(emission.mean),
+        _rgb(albedo.mean) if albedo_texture is None else albedo_texture.mean,
+        _rgb(emission.mean) if emission_texture is None else emission_texture.mean,
         1.0 if opaque else float(opacity.mean[0]),
         min(threshold, 1.0) if textured else 0.0,
-        None if albedo.mapping is None else network.texture(_with_bounded_border(albedo)),
-        None
-        if emission.mapping is None or emission.pixels.max() == 0.0
-        else network.texture(_with_bounded_border(emission)),
-        network.texture(_with_bounded_border(opacity)) if textured else None,
+        albedo_texture,
+        emission_texture,
+        opacity_texture,
         normal_texture=None if normal is None else network.texture(normal),
     )
     albedo_value, emission_value, opacity_value = (x if x.primvars else None for x in (albedo, emission, opacity))
@@ -392,7 +394,7 @@ def _evaluated(
 
 def _with_bounded_border(value: ShadingValue) -> ShadingValue:
     """The value with its border clamped to the range of its pixels, at least [0, 1]."""
-    top = max(float(value.pixels.max()), 0.0)
+    top = max(value.highest, 0.0)
     return ShadingValue(value.pixels, np.clip(value.outside, 0.0, max(top, 1.0)), value.mapping, value.key, value.name)
 
 

@@ -3,10 +3,10 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
+from warp_ir.image.io import check_input
 from warp_ir.scene import InputError
 from warp_ir.usd.stage.crate_validation import validate_crate
 from warp_ir.usd.stage.mtlx_layers import layers_with_mtlx
@@ -127,10 +127,7 @@ def _open_layer(path: str) -> Sdf.Layer:
     Raises:
         InputError: There is no such file, or it is not readable as USD.
     """
-    if not Path(path).exists():
-        raise InputError(f"{path}: no such file")
-    if Path(path).is_dir():
-        raise InputError(f"{path}: is a directory, not a USD file")
+    check_input(path, "a USD file")
     try:
         validate_crate(path)
         layer = Sdf.Layer.FindOrOpen(path)
