@@ -62,9 +62,8 @@ def instanced(*, emission=0.0, count=3000):
     matrices = np.tile(np.eye(4), (count, 1, 1))
     matrices[:, 0, 3] = 3.0 * np.arange(count)
     balls = [mesh(name, points, triangles) for name in ("a", "b")]
-    groups = tuple(ir.Instances(ball.name, (k,), matrices + k) for k, ball in enumerate(balls))
-    for group in groups:
-        group.matrices[:, 3] = (0.0, 0.0, 0.0, 1.0)
+    other = matrices + np.array([[1.0], [1.0], [1.0], [0.0]])
+    groups = tuple(ir.Instances(m.name, (k,), x) for k, (m, x) in enumerate(zip(balls, (matrices, other), strict=True)))
     return ir.Scene(tuple(balls), (ir.Material("m", (0.5,) * 3, (emission,) * 3),), instances=groups)
 
 
