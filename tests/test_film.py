@@ -81,14 +81,14 @@ def test_films_of_different_size_do_not_merge(device):
 
 
 def test_iterations_of_another_scene_are_refused(device):
-    """A film takes iterations of the renderer that made it, and none after the scene was replaced."""
+    """A film takes iterations of the scene that it was made for, and none after that was replaced."""
     renderer = Renderer(furnace(level=1), SETTINGS, device=device)
     film = renderer.new_film()
     renderer.add_iteration(film, 0)
-    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+    with pytest.raises(ir.InputError, match="film: is not of this renderer's present scene"):
         Renderer(furnace(level=1), SETTINGS, device=device).add_iteration(film, 1)
     renderer.update(furnace(0.3, level=1))
-    with pytest.raises(ir.InputError, match="film: is not of this renderer"):
+    with pytest.raises(ir.InputError, match="film: is not of this renderer's present scene"):
         renderer.add_iteration(film, 1)
 
 

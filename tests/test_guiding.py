@@ -75,14 +75,15 @@ def variances(scene, device, guiding):
 def test_light_is_the_same(wide, name, guided, device):
     """Guided VPLs and path tracing, which knows of no guide, agree: the mean of z² is 1, as far as errors are known.
 
-    Pixels share their VPLs: the mean of all of them has the standard error of its spread over the iterations.
+    Pixels share their VPLs: the mean of all of them has the standard error of its spread over the iterations. Camera
+    rays are stratified, so that at edges, of which a terrain has many, errors are up to a sixth smaller than is said.
     """
     scene = getattr(wide, name)()
     truth = film_of(scene, estimator="path", iterations=1500, device=device)
     renderer, film, averages = iterations_of(scene, 24, 200, device)
     assert {key for key in GUIDED if renderer.launcher.profile.counts[key]} >= guided
     z = z_scores(film.radiance(), film.standard_error(), truth.radiance(), truth.standard_error())
-    assert 0.8 < np.mean(z**2) < 1.25
+    assert 0.7 < np.mean(z**2) < 1.25
     reference = truth.radiance().mean(dtype=np.float64)
     error = np.hypot(np.std(averages, ddof=1) / len(averages) ** 0.5, truth.standard_error().mean() / 24)
     assert abs(np.mean(averages) - reference) < 4.0 * error

@@ -20,7 +20,7 @@ MISUSES = {
     "ir.load_usd('room.usda', complexty='high')": "call-arg",
     "ir.RenderSettings(width='wide')": "arg-type",
     "ir.RenderSettings(512)": "call-arg",
-    "ir.Renderer(scene)": "call-arg",
+    "ir.Renderer()": "call-arg",
     "film.radiance().shap": "attr-defined",
     "film.aov()": "call-arg",
     "ir.write_image(film, 'room.png')": "arg-type",

@@ -319,8 +319,12 @@ def trace_primary(
     *,
     iteration: int,
     seed: int,
+    counted_as: str = "primary_rays",
 ) -> None:
-    """Fills the tiles of the G-buffer with what the camera sees in one iteration; -1: through the pixels' centres."""
+    """Fills the tiles of the G-buffer with what the camera sees in one iteration; -1: through the pixels' centres.
+
+    The profile counts the rays under the name `counted_as`.
+    """
     count = indices(gbuffer.tiles)
     launcher.launch(_trace_primary, count, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
-    launcher.profile.counts["primary_rays"] += gbuffer.tiles.pixels
+    launcher.profile.counts[counted_as] += gbuffer.tiles.pixels

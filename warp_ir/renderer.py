@@ -71,7 +71,7 @@ class Renderer:
         self._guiding = guiding
         self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._shutter: list[_ShutterState] = []
-        self._origin: object = None  # of the films of this upload
+        self._origin: Scene | None = None
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
         estimator = ESTIMATORS[settings.estimator]
@@ -139,11 +139,11 @@ class Renderer:
         Films of one renderer may be added to from several threads: they take turns.
 
         Raises:
-            InputError: The film was not made by `new_film` of this renderer for the present scene.
+            InputError: The film is not one that `new_film` makes for the present scene.
         """
         with self.launcher.exclusive:
-            if film.origin is not self._origin:
-                raise InputError("film: is not of this renderer and its present scene; new_film() makes one")
+            if film.origin is not self._origin or (film.width, film.height) != self._size():
+                raise InputError("film: is not of this renderer's present scene and size; new_film() makes one")
             self._gbuffer.tiles = film.tiles
             number = stratum(iteration, len(self._shutter).bit_length() - 1)
             state = self._shutter[number]
@@ -218,7 +218,7 @@ class Renderer:
             raise InputError(f"scene: shutter has {len(scene.shutter)} samples, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
         uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
-        self._shutter, self._origin = [], object()
+        self._shutter, self._origin = [], scene
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
@@ -238,6 +238,10 @@ class Renderer:
         if self._layout != layout:
             self._gbuffer, self._block = layout.allocate(launcher)
             self._layout = layout
+
+    def _size(self) -> tuple[int, int]:
+        """Columns and rows of the films."""
+        return self._shutter[0].camera.columns, self._shutter[0].camera.rows
 
     def _is_adaptive(self) -> bool:
         """Whether iterations may leave out tiles.

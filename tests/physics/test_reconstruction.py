@@ -195,9 +195,9 @@ def test_two_films_filter_as_one(device):
 def test_a_picture_needs_no_renderer(device):
     """The filter works in the renderer's memory while that is there, and else in its own: the same bits."""
     settings = ir.RenderSettings(width=24, light_paths=64)
-    films = []
+    films, scene = [], cornell_box()
     for _ in range(2):
-        renderer = ir.Renderer(cornell_box(), settings, device=device)
+        renderer = ir.Renderer(scene, settings, device=device)
         films.append(renderer.new_film())
         for iteration in range(2):
             renderer.add_iteration(films[-1], iteration)

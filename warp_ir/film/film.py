@@ -117,7 +117,7 @@ class Film:
         self.reconstruction: PictureFilter | None = None
         """The filter of the picture; None: the picture is the unfiltered mean."""
         self.origin: object = None
-        """The renderer's upload of the scene to which its iterations belong; None: it was made without a renderer."""
+        """The `Scene` to which its iterations belong; None: it was made without a renderer."""
         self.emits = False
         """Whether anything in the scene emits: then no surface need be black."""
         self._resolved: tuple[int, npt.NDArray[np.float32]] | None = None  # iterations, and the picture made of them

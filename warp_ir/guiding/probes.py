@@ -146,7 +146,7 @@ def trace_camera_probes(
         has_normal_maps=scene.data.normal_map_count > 0,
         has_emission=False,
     )
-    trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble)
+    trace_primary(scene, whole, launcher, gbuffer, iteration=0, seed=scramble, counted_as="probe_paths")
     n = paths * _MAX_VERTICES * _EMITTER_SAMPLES
     rows = ProbeRows()
     for name, dtype in (("emitter", wp.int32), ("score", wp.float32), ("position", wp.vec3), ("normal", wp.vec3)):

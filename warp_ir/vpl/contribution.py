@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.device.launcher import Launcher
+from warp_ir.device.launcher import MAX_REGISTERS, Launcher
 from warp_ir.device_scene import DeviceScene, SceneData, camera_data
 from warp_ir.gbuffer import GBuffer, camera_vertex, new_gbuffer, reflecting_pixel, trace_primary
 from warp_ir.lights import light_visibility
@@ -38,7 +38,7 @@ def geometry_term(
     return at_point * at_vpl / squared
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _sum_contributions(
     first: int,
     scene: SceneData,
