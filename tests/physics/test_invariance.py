@@ -109,13 +109,14 @@ def test_scale_and_position_change_only_rounding(estimator, scale, shift, device
     """Scaled by 1e-4 to 1e6 or moved by 1e5 of its size, a scene is the same picture up to rounding.
 
     Rounding can decide a ray at an edge the other way: allow that for 1 % of the pixels. In `vpl` one VPL more or
-    less shifts what all pixels choose, and so a part of the noise: it may differ by half of what a seed changes.
+    less shifts what all pixels choose, and so a part of the noise; a guided path takes another of its eight directions.
+    Then the noise differs by 0.38 to 0.53 of what a seed changes (six pairs of scale and place), without guiding by 0.3.
     """
     moved = transformed(box_with_lights(), np.eye(3) * scale, np.full(3, shift))
     here, there = render(box_with_lights(), estimator, device).radiance(), render(moved, estimator, device).radiance()
     if estimator == "vpl":
         reseeded = render(box_with_lights(), estimator, device, seed=1).radiance()
-        assert np.abs(here - there).mean() <= 0.5 * np.abs(here - reseeded).mean()
+        assert np.abs(here - there).mean() <= 0.75 * np.abs(here - reseeded).mean()
         return
     different = np.abs(here - there).max(axis=2) > 2e-3 * here.mean()
     assert different.mean() <= 0.01
