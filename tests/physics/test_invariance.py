@@ -110,7 +110,7 @@ def test_scale_and_position_change_only_rounding(estimator, scale, shift, device
 
     Rounding can decide a ray at an edge the other way: allow that for 1 % of the pixels. In `vpl` one VPL more or
     less shifts what all pixels choose, and so a part of the noise; a guided path takes another of its eight directions.
-    Then the noise differs by 0.38 to 0.53 of what a seed changes (six pairs of scale and place), without guiding by 0.3.
+    Then it differs by 0.38 to 0.53 of what a seed changes (six pairs of scale and place); without guiding by 0.3.
     """
     moved = transformed(box_with_lights(), np.eye(3) * scale, np.full(3, shift))
     here, there = render(box_with_lights(), estimator, device).radiance(), render(moved, estimator, device).radiance()
