@@ -270,3 +270,21 @@ def test_visibility_of_purposes(tmp_path):
     )
     scene = load(tmp_path, text, purposes=("render", "guide"))
     assert [mesh.name for mesh in scene.meshes] == ["/ar", "/X/bg", "/X/Y/cg", "/X/Y/cr"]
+
+
+def test_a_package_with_a_wrong_checksum_is_refused(tmp_path):
+    """One flipped bit of a layer in a .usdz is found before USD reads it, which ends the process on some of them."""
+    from pxr import Usd, UsdUtils
+
+    layer = tmp_path / "a.usdc"
+    stage = Usd.Stage.CreateNew(str(layer))
+    stage.DefinePrim("/World")
+    stage.GetRootLayer().Save()
+    package = tmp_path / "a.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(layer), str(package))
+    load_usd(package)
+    data = bytearray(package.read_bytes())
+    data[data.index(b"PXR-USDC") + 40] ^= 1
+    package.write_bytes(data)
+    with pytest.raises(InputError, match="is damaged, its checksum is wrong"):
+        load_usd(package)

@@ -5,6 +5,7 @@ Otherwise a damaged byte in a count costs gigabytes, and the seconds to touch th
 
 import mmap
 import struct
+import zlib
 from collections.abc import Iterator
 
 from warp_ir.scene import InputError
@@ -22,7 +23,7 @@ def validate_crate(path: str) -> None:
     """Check the table sizes of a crate file, or of those in a .usdz package; other files are left to USD.
 
     Raises:
-        InputError: A table is larger than its data can be.
+        InputError: A table is larger than its data can be, or the checksum of a package does not fit its data.
     """
     for name, data in _crate_files(path):
         try:
@@ -43,11 +44,15 @@ def _crate_files(path: str) -> Iterator[tuple[str, memoryview]]:
         yield "", data
     offset = 0
     while bytes(data[offset : offset + 4]) == b"PK\3\4" and offset + _LOCAL.size <= len(data):
-        *_, size, _, name_length, extra_length = _LOCAL.unpack_from(data, offset)
+        *_, checksum, size, _, name_length, extra_length = _LOCAL.unpack_from(data, offset)
         name = bytes(data[offset + _LOCAL.size :][:name_length]).decode("ascii", "replace")
         offset += _LOCAL.size + name_length + extra_length
         if bytes(data[offset : offset + 8]) == _MAGIC:
-            yield f"{name}: ", data[offset : offset + size]
+            file_data = data[offset : offset + size]
+            # USD itself does not look, and ends the process, or never ends, on some damaged bytes.
+            if checksum and zlib.crc32(file_data) != checksum:
+                raise InputError(f"{path}: cannot be opened as USD: {name} is damaged, its checksum is wrong")
+            yield f"{name}: ", file_data
         offset += size
 
 
