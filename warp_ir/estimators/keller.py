@@ -29,11 +29,10 @@ from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
-from warp_ir.lights import light_visibility
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.settings import ResolvedSettings
 from warp_ir.tiles import indices
-from warp_ir.vpl.contribution import geometry_term
+from warp_ir.vpl.contribution import UNBOUNDED, vpl_irradiance
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
 
@@ -56,18 +55,11 @@ def _accumulate(
     indirect = wp.vec3(0.0)
     x = camera_vertex(gbuffer, pixel)
     for k in range(vpls.count[0]):
-        g = geometry_term(x.position, x.normal, x.shading_normal, vpls.position[k], vpls.normal[k])
-        if g > 0.0:
-            modifiers = int(-1)
-            if scene.modifier_count > 0 and k < vpls.on_lights:
-                modifiers = vpls.modifiers[k]
-            # V, and the light's shaping and links if it has any.
-            visibility = light_visibility(scene, modifiers, x, vpls.position[k])
-            irradiance = wp.cw_mul(vpls.intensity[k], visibility) * wp.min(g, bound)
-            if vpls.bounce[k] == 0:
-                direct += irradiance
-            else:
-                indirect += irradiance
+        irradiance = vpl_irradiance(scene, vpls, k, x, bound)
+        if vpls.bounce[k] == 0:
+            direct += irradiance
+        else:
+            indirect += irradiance
     gbuffer.normal_or_direct[pixel] = direct / wp.pi
     gbuffer.indirect[pixel] = indirect / wp.pi
 
@@ -83,7 +75,7 @@ class Keller:
         self._scratch, self._launcher = scratch, scratch.launcher
         self._unguided = unguided(scene, scratch.launcher)
         radius = settings.bound_radius * scene.extent
-        self._bound = 1.0 / radius**2 if radius > 0.0 else 3.0e38
+        self._bound = 1.0 / radius**2 if radius > 0.0 else UNBOUNDED
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""

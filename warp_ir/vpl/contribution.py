@@ -12,11 +12,14 @@ from warp_ir.gbuffer import GBuffer, camera_vertex, new_gbuffer, reflecting_pixe
 from warp_ir.lights import light_visibility
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
+from warp_ir.surface import ShadingPoint
 from warp_ir.tiles import TILE
 from warp_ir.vpl.emission import VplBuffer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
+UNBOUNDED = wp.constant(3.0e38)
+"""A bound on G that bounds nothing."""
 _POINTS = 1024
 """Approximate number of points that stand for a whole picture."""
 
@@ -38,6 +41,19 @@ def geometry_term(
     return at_point * at_vpl / squared
 
 
+@wp.func
+def vpl_irradiance(scene: SceneData, vpls: VplBuffer, k: int, x: ShadingPoint, bound: float) -> wp.vec3:
+    """The irradiance I min(G, bound) V that VPL k adds to a point, with the light's shaping and links if it has any."""
+    g = geometry_term(x.position, x.normal, x.shading_normal, vpls.position[k], vpls.normal[k])
+    if g <= 0.0:
+        return wp.vec3(0.0)
+    modifiers = int(-1)
+    if scene.modifier_count > 0 and k < vpls.on_lights:
+        modifiers = vpls.modifiers[k]
+    visibility = light_visibility(scene, modifiers, x, vpls.position[k])
+    return wp.cw_mul(vpls.intensity[k], visibility) * wp.min(g, bound)
+
+
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _sum_contributions(
     first: int,
@@ -53,14 +69,8 @@ def _sum_contributions(
         pixel = reflecting_pixel(gbuffer, i)
         if pixel >= 0:
             x = camera_vertex(gbuffer, pixel)
-            g = geometry_term(x.position, x.normal, x.shading_normal, vpls.position[k], vpls.normal[k])
-            if g > 0.0:
-                modifiers = int(-1)
-                if scene.modifier_count > 0 and k < vpls.on_lights:
-                    modifiers = vpls.modifiers[k]
-                visibility = light_visibility(scene, modifiers, x, vpls.position[k])
-                irradiance = wp.cw_mul(vpls.intensity[k], visibility) * g
-                total += wp.cw_mul(irradiance, gbuffer.albedo[pixel]) / wp.pi
+            irradiance = vpl_irradiance(scene, vpls, k, x, UNBOUNDED)
+            total += wp.cw_mul(irradiance, gbuffer.albedo[pixel]) / wp.pi
     contribution[k] = total
 
 
