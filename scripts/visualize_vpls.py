@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 
 import warp_ir as ir
-from warp_ir.preview import COLORINGS, picture_vpls, plotter
-from warp_ir.preview.plot import pick_vpls
+from warp_ir.preview import COLORINGS, pick_vpls, picture_vpls, plotter
 
 
 def main() -> None:

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_ir.image.io import check_output, whole_file
-from warp_ir.preview.plot import VplCloud, add_vpls, plotter, select
+from warp_ir.preview.plot import add_vpls, plotter, select
 from warp_ir.scene import InputError, Scene
 
 if TYPE_CHECKING:
     import pyvista
+
+    from warp_ir.vpl.trace import Vpls
 
 ORDERS = ("path", "bounce")
 """In which order an animation adds VPLs."""
@@ -20,7 +22,7 @@ _PATH_FRAMES, _BOUNCE_FRAMES, _LAST_FRAMES = 48, 12, 12
 """Frames in which all paths are added, of each bounce, and of the complete cloud at the end."""
 
 
-def picture_vpls(scene: Scene, vpls: VplCloud, path: str | os.PathLike[str], **options: Any) -> Path:
+def picture_vpls(scene: Scene, vpls: "Vpls", path: str | os.PathLike[str], **options: Any) -> Path:
     """Writes a picture of VPLs in their scene; no display is needed.
 
     Args:
@@ -77,7 +79,7 @@ def write_model(plot: "pyvista.Plotter", path: str | os.PathLike[str]) -> Path:
 
 def animate_vpls(
     scene: Scene,
-    vpls: VplCloud,
+    vpls: "Vpls",
     path: str | os.PathLike[str],
     *,
     order: str = "path",

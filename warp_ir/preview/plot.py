@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,8 @@ from warp_ir.scene import Camera, InputError, Projection, Scene
 
 if TYPE_CHECKING:
     import pyvista
+
+    from warp_ir.vpl.trace import Vpls
 
 COLORINGS = ("hue", "flux", "bounce", "contribution")
 """What the colour of a VPL can show."""
@@ -26,49 +28,9 @@ _RADIUS = 0.006
 """Radius of the disc of a VPL of median intensity, per extent of the scene."""
 
 
-class VplCloud(Protocol):
-    """The arrays of a VPL cloud that are drawn, as in `warp_ir.vpl.trace.Vpls`."""
-
-    @property
-    def positions(self) -> npt.NDArray[np.floating]:
-        """[n, 3], world space; where `directional`, the direction towards the light."""
-
-    @property
-    def normals(self) -> npt.NDArray[np.floating]:
-        """[n, 3], unit; zero where the VPL shines the same in all directions."""
-
-    @property
-    def intensity(self) -> npt.NDArray[np.floating]:
-        """[n, 3], in any unit."""
-
-    @property
-    def bounce(self) -> npt.NDArray[np.integer]:
-        """[n], number of reflections before."""
-
-    @property
-    def directional(self) -> npt.NDArray[np.bool_]:
-        """[n], whether the VPL is infinitely far away."""
-
-    @property
-    def path(self) -> npt.NDArray[np.integer]:
-        """[n], number of the light path."""
-
-    @property
-    def parent(self) -> npt.NDArray[np.integer]:
-        """[n], index of the VPL at the vertex before; -1: none."""
-
-    @property
-    def contribution(self) -> npt.NDArray[np.floating] | None:
-        """[n, 3], radiance that each adds to the picture or to a pixel; None: not known."""
-
-    @property
-    def pixel_position(self) -> npt.NDArray[np.floating] | None:
-        """[3], the point that the pixel sees; None: `contribution` is for no pixel."""
-
-
 def plotter(
     scene: Scene,
-    vpls: VplCloud | None = None,
+    vpls: "Vpls | None" = None,
     *,
     color_by: str = "hue",
     bounces: Collection[int] | None = None,
@@ -83,8 +45,8 @@ def plotter(
     """A plotter that shows a scene in its albedo, and VPLs in it as discs on their surfaces, seen from the lit side.
 
     The area of a disc is proportional to the VPL's intensity, within limits. Lights are yellow outlines, the camera is
-    a green pyramid. Walls between the eye and the scene are left out. More can be added before `show()`; in a window, a
-    click on a disc writes the VPL's numbers into the picture.
+    a green pyramid. Walls between the eye and the scene are left out. More can be added before `show()`; after
+    `pick_vpls`, a right click on a disc writes the VPL's numbers into the window.
 
     Args:
         scene: The scene in which the VPLs were traced.
@@ -137,7 +99,7 @@ def plotter(
     return made
 
 
-def select(vpls: VplCloud, bounces: Collection[int] | None, min_contribution: float) -> npt.NDArray[np.intp]:
+def select(vpls: "Vpls", bounces: Collection[int] | None, min_contribution: float) -> npt.NDArray[np.intp]:
     """Indices of the VPLs to show, as `plotter` describes."""
     keep = np.ones(len(vpls.positions), bool)
     if bounces is not None:
@@ -148,7 +110,7 @@ def select(vpls: VplCloud, bounces: Collection[int] | None, min_contribution: fl
     return np.flatnonzero(keep)
 
 
-def add_vpls(plot: Any, vpls: VplCloud, shown: npt.NDArray[np.intp], color_by: str, size: float) -> None:
+def add_vpls(plot: Any, vpls: "Vpls", shown: npt.NDArray[np.intp], color_by: str, size: float) -> None:
     """Adds the VPLs as discs, or replaces those that were added before.
 
     Args:
@@ -189,7 +151,7 @@ def add_vpls(plot: Any, vpls: VplCloud, shown: npt.NDArray[np.intp], color_by: s
         plot.add_mesh(discs, scalars=name, cmap="inferno", clim=(top - _DECADES, top), scalar_bar_args=bar, **style)
 
 
-def _add_paths(plot: Any, vpls: VplCloud, shown: npt.NDArray[np.intp], size: float) -> None:
+def _add_paths(plot: Any, vpls: "Vpls", shown: npt.NDArray[np.intp], size: float) -> None:
     """Adds light paths, the directions of directional VPLs, and the shadow rays from a pixel that found a VPL."""
     lines = path_lines(vpls.positions, vpls.parent, vpls.directional, shown, size)
     if lines.n_cells:
@@ -201,7 +163,7 @@ def _add_paths(plot: Any, vpls: VplCloud, shown: npt.NDArray[np.intp], size: flo
             plot.add_mesh(rays, color=_RAY_COLOR, opacity=0.5, line_width=1, lighting=False, name="shadow rays")
 
 
-def describe(vpls: VplCloud, index: int) -> str:
+def describe(vpls: "Vpls", index: int) -> str:
     """The numbers of a VPL, for the picture of a plotter."""
     position, intensity = np.asarray(vpls.positions)[index], np.asarray(vpls.intensity)[index]
     lines = [
@@ -214,7 +176,7 @@ def describe(vpls: VplCloud, index: int) -> str:
     return "\n".join(lines)
 
 
-def pick_vpls(plot: "pyvista.Plotter", vpls: VplCloud) -> None:
+def pick_vpls(plot: "pyvista.Plotter", vpls: "Vpls") -> None:
     """Lets a right click, or the key P, on a VPL write its numbers into the window of a plotter."""
 
     def show(cell: Any) -> None:
@@ -242,7 +204,7 @@ def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
     return colors
 
 
-def _flux(vpls: VplCloud) -> npt.NDArray[np.float64]:
+def _flux(vpls: "Vpls") -> npt.NDArray[np.float64]:
     """Flux of each VPL, mean of the channels [W]: π I where it shines by the cosine, 4π I where in all directions."""
     intensity = np.asarray(vpls.intensity, dtype=np.float64).mean(axis=1)
     everywhere = ~np.asarray(vpls.normals).any(axis=1)
@@ -250,7 +212,7 @@ def _flux(vpls: VplCloud) -> npt.NDArray[np.float64]:
     return flux
 
 
-def _contribution(vpls: VplCloud) -> npt.NDArray[np.float64]:
+def _contribution(vpls: "Vpls") -> npt.NDArray[np.float64]:
     if vpls.contribution is None:
         raise InputError("vpls: have no contribution; trace_vpls(..., contribution_to=...) computes it")
     contribution: npt.NDArray[np.float64] = np.asarray(vpls.contribution, dtype=np.float64).mean(axis=1)
