@@ -283,7 +283,7 @@ STEPS: dict[str, tuple[Callable[[argparse.Namespace], Iterator[Record]], float]]
     "rays_per_second": (rays_per_second, 40.0),
     "error": (error, 60.0),
 }
-"""What is done, in this order, with its time box [s]; together 8 minutes."""
+"""The steps of the check in their order, each with its time box [s]; together 8 minutes."""
 
 
 def compile_for(arch: int) -> int:

@@ -101,7 +101,7 @@ def test_choices_that_cannot_be_are_named():
 
 @pytest.mark.extended
 class TestOfTheCornellBox:
-    """What is drawn of real VPLs."""
+    """Drawings, pages and animations of VPLs that were traced."""
 
     SCENE = cornell_box()
 

@@ -174,7 +174,7 @@ def Cube "Coal" {
     ],
 )
 def test_black_pictures_say_so(tmp_path, capsys, flags, word):
-    """Of a closed room from outside, from in its wall, without light, of coal: it is said, and no error claimed."""
+    """A closed room from outside, from in its wall, without light, of coal: it is said, and no error claimed."""
     file, picture = tmp_path / "a.usda", tmp_path / "a.npy"
     file.write_text("#usda 1.0\n" + ROOM)
     assert main(["render", str(file), str(picture), "--width", "8", "--iterations", "4", *flags]) == 0

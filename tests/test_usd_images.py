@@ -236,7 +236,7 @@ def test_windows_of_textures_on_surfaces(tmp_path):
 
 @pytest.mark.parametrize("names", [("R", "G", "B"), ("Y",)])
 def test_the_part_with_colour_counts(tmp_path, names):
-    """Of a multi-part EXR it is the part with R, G and B, else with luminance, in whatever place."""
+    """The part of a multi-part EXR with R, G and B is read, else the one with luminance, in whatever place."""
     parts = [("Z",), ("N.X", "N.Y", "N.Z"), names, ("albedo.R", "albedo.G", "albedo.B")]
     specs = []
     for k, channels in enumerate(parts):

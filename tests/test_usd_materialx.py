@@ -228,7 +228,7 @@ LENIENT = {
 
 @pytest.mark.parametrize("text", LENIENT.values(), ids=LENIENT)
 def test_what_the_librarys_parser_reads(looks, text):
-    """The same scene as without the oddity."""
+    """The file gives the same scene as without the oddity."""
     expected = only_material(load(looks, ROOT + mesh()))
     (looks / "looks.mtlx").write_text(text, encoding="utf-8")
     scene = load(looks, ROOT + mesh())

@@ -1,7 +1,5 @@
 """VPLs written as UsdLux lights: direct light by them is what the VPLs give."""
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,19 +48,15 @@ def test_direct_light_by_the_lights_is_that_of_the_vpls(lit_by_vpls):
 
 
 @pytest.mark.slow
-def test_mitsuba_sees_the_same(lit_by_vpls):
+def test_mitsuba_sees_the_same(lit_by_vpls, monkeypatch):
     """Mitsuba, lit by the lights of the file, has that picture as well."""
     mitsuba = pytest.importorskip("mitsuba")
-    spec = importlib.util.spec_from_file_location("make_references", ROOT / "benchmarks" / "make_references.py")
-    references = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        spec.loader.exec_module(references)
-    finally:
-        sys.path.pop(0)
-    references.use_mitsuba("llvm_ad_rgb")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    from make_references import to_mitsuba, use_mitsuba
+
+    use_mitsuba("llvm_ad_rgb")
     scene, expected = lit_by_vpls
-    translated = references.to_mitsuba(scene, SETTINGS.width, SETTINGS.height, 0)
+    translated = to_mitsuba(scene, SETTINGS.width, SETTINGS.height, 0)
     integrator = mitsuba.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
     picture = np.array(mitsuba.render(translated, integrator=integrator, spp=4096))[..., :3]
     assert_same_light(picture, expected)

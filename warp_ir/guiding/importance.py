@@ -47,9 +47,9 @@ class CellTree:
         codes, self.leaf = np.unique(cell, return_inverse=True)
         """The leaf of each vertex."""
         self.codes = [codes]
-        """Of the cells of each level that hold vertices; the first level is the finest."""
+        """The numbers, at each level, of the cells that hold vertices; the first level is the finest."""
         self.parents: list[Ints] = []
-        """Of each level's cells, in the next level."""
+        """The index, for each cell of a level, of the cell of the next level that contains it."""
         for level in range(_LEVELS, 0, -1):
             side, x, y, z = (codes >> 3 * level, *(codes >> k * level & (1 << level) - 1 for k in (2, 1, 0)))
             half = level - 1

@@ -243,7 +243,7 @@ class Vertices:
     """[n], whether it is the first vertex of a light path."""
 
     def __add__(self, other: "Vertices") -> "Vertices":
-        """Those of both; light paths with the same number are no longer told apart."""
+        """The vertices of both records; light paths with the same number are no longer told apart."""
         joined = {f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
         joined["next"][len(self.next) :] += np.where(other.next >= 0, len(self.next), 0)
         return Vertices(**joined)
