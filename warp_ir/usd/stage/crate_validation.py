@@ -1,12 +1,15 @@
-"""Validates the table sizes in crate files (.usdc) before USD allocates them.
+"""Validates the tables of a crate file (.usdc) on which USD's reader relies without a look.
 
-Otherwise a damaged byte in a count costs gigabytes, and the seconds to touch them, before USD refuses the file.
+A damaged byte in a count costs gigabytes, and the seconds to touch them, before USD refuses the file; one in the tree
+of paths lets USD visit its nodes again and again, from several threads at once, until the process ends.
 """
 
 import mmap
 import struct
 import zlib
 from collections.abc import Iterator
+
+import numpy as np
 
 from warp_ir.scene import InputError
 
@@ -15,19 +18,22 @@ _LOCAL = struct.Struct("<4s5H3L2H")
 """Header of each file in a ZIP archive."""
 _TABLES = {"TOKENS": 0, "STRINGS": 0, "FIELDS": 2, "FIELDSETS": 1, "PATHS": 3, "SPECS": 3}
 """Tables that begin with a count, with the number of compressed blocks that follow it."""
+_FIRST_COMPRESSED = b"\0\4"
+"""The version of crate files from which on tables are compressed: 0.4."""
 _MAX_VALUES_PER_BYTE = 2048
 """Maximum number of values per compressed byte: LZ4 packs 255 bytes into one, integer coding 4 values into each."""
 
 
 def validate_crate(path: str) -> None:
-    """Check the table sizes of a crate file, or of those in a .usdz package; other files are left to USD.
+    """Check the tables of a crate file, or of those in a .usdz package; other files are left to USD.
 
     Raises:
-        InputError: A table is larger than its data can be, or the checksum of a package does not fit its data.
+        InputError: A table is larger than its data can be, the paths are no tree, or the checksum of a package does
+            not fit its data.
     """
     for name, data in _crate_files(path):
         try:
-            bad = _oversized_table(data)
+            bad = _damaged_table(data)
         except struct.error:  # truncated: USD detects that at once
             bad = ""
         if bad:
@@ -56,20 +62,25 @@ def _crate_files(path: str) -> Iterator[tuple[str, memoryview]]:
         offset += size
 
 
-def _oversized_table(data: memoryview) -> str:
-    """Name of the first table with an impossible size; "" if there is none."""
+def _damaged_table(data: memoryview) -> str:
+    """Name of the first table with an impossible size, or of paths that are no tree; "" if there is none."""
     (directory,) = struct.unpack_from("<q", data, 16)
     if not 0 < directory < len(data):
         return ""
     (count,) = struct.unpack_from("<Q", data, directory)
     if directory + 8 + 32 * count > len(data):
         return "of contents"
+    if bytes(data[8:10]) < _FIRST_COMPRESSED:
+        return ""
     for number in range(count):
         title, start, size = struct.unpack_from("<16sqq", data, directory + 8 + 32 * number)
         name: str = title.rstrip(b"\0").decode("ascii", "replace")
         if name not in _TABLES:
             continue
-        if start < 0 or size < 0 or start + size > len(data) or not _fits(name, data[start : start + size]):
+        table = data[max(start, 0) : start + size]
+        if start < 0 or size < 0 or start + size > len(data) or not _fits(name, table):
+            return name
+        if name == "PATHS" and not _is_tree(table):
             return name
     return ""
 
@@ -95,3 +106,98 @@ def _fits(name: str, table: memoryview) -> bool:
         if offset > len(table):
             return False
     return True
+
+
+def _is_tree(table: memoryview) -> bool:
+    """Whether the compressed nodes of a table PATHS are one tree.
+
+    Node i has a jump: -2 without child and sibling, -1 for a child i + 1 alone, 0 for a sibling i + 1 alone, and j > 0
+    for a child i + 1 and a sibling i + j. The nodes are a tree if each but the first is reached exactly once.
+    """
+    (count,) = struct.unpack_from("<Q", table, 8)
+    offset = 16
+    for _ in range(2):  # the indices of the paths and of their tokens, which USD checks
+        (packed,) = struct.unpack_from("<Q", table, offset)
+        offset += 8 + packed
+    (packed,) = struct.unpack_from("<Q", table, offset)
+    jumps = _integers(table[offset + 8 : offset + 8 + packed], count)
+    if jumps is None or (jumps < -2).any():
+        return False
+    nodes = np.arange(count)
+    reached = np.concatenate([nodes[jumps >= -1] + 1, nodes[jumps > 0] + jumps[jumps > 0]])
+    return bool(np.array_equal(np.sort(reached), nodes[1:]))
+
+
+def _integers(packed: memoryview, count: int) -> np.ndarray | None:
+    """Integers [count] of a compressed array; None if its data are damaged.
+
+    The data are LZ4 in chunks. Uncompressed they are the most common difference of neighbours, a code of two bits for
+    each difference (that one, or 8, 16 or 32 bits of its own), and the bits (`pxr/usd/sdf/integerCoding.h`).
+    """
+    if count == 0:
+        return np.empty(0, np.int64)
+    size = 4 + (2 * count + 7) // 8 + 4 * count
+    try:
+        data = np.frombuffer(_uncompress(packed, size), np.uint8)
+        codes = (data[4 : 4 + (2 * count + 7) // 8, None] >> np.array([0, 2, 4, 6]) & 3).ravel()[:count]
+        widths = np.array([0, 1, 2, 4])[codes]
+        starts = np.cumsum(widths) - widths + 4 + (2 * count + 7) // 8
+        differences = np.full(count, data[:4].view("<i4")[0], np.int64)
+        for code, kind in ((1, "<i1"), (2, "<i2"), (3, "<i4")):
+            found = np.flatnonzero(codes == code)
+            width = np.dtype(kind).itemsize
+            differences[found] = data[starts[found, None] + np.arange(width)].view(kind)[:, 0]
+    except (struct.error, IndexError, ValueError):
+        return None
+    return np.cumsum(differences).astype(np.int32)  # wraps around as the coder does
+
+
+def _uncompress(packed: memoryview, size: int) -> bytes:
+    """About `size` bytes that USD compressed: one block, or as many with their sizes as the first byte says."""
+    if packed[0] == 0:
+        return bytes(_lz4(packed[1:], size))
+    chunks, offset = bytearray(), 1
+    for _ in range(packed[0]):
+        (length,) = struct.unpack_from("<i", packed, offset)
+        chunks += _lz4(packed[offset + 4 : offset + 4 + length], size)
+        offset += 4 + length
+    return bytes(chunks)
+
+
+def _lz4(block: memoryview, size: int) -> bytearray:
+    """The bytes of a block of LZ4; more than `size` are not read further.
+
+    Each sequence is a token (two lengths), literals, and a match: two bytes say how far back its copy begins
+    (`lz4_Block_format.md`). A table of paths is short enough for Python.
+
+    Raises:
+        IndexError: The block ends within a sequence.
+        ValueError: A match begins before the data.
+    """
+    out, at = bytearray(), 0
+
+    def length(nibble: int) -> int:
+        nonlocal at
+        total, more = nibble, nibble == 15
+        while more:
+            total += block[at]
+            more = block[at] == 255
+            at += 1
+        return total
+
+    while len(out) <= size:
+        token = block[at]
+        at += 1
+        literals = length(token >> 4)
+        out += block[at : at + literals]
+        at += literals
+        if at >= len(block):  # the last sequence has no match
+            break
+        back = block[at] | block[at + 1] << 8
+        at += 2
+        copied = 4 + length(token & 15)
+        if not 0 < back <= len(out):
+            raise ValueError("a match begins before the data")
+        match = out[-back:][:copied]
+        out += (match * (copied // len(match) + 1))[:copied]
+    return out
