@@ -20,6 +20,7 @@ from typing import Any
 
 import warp as wp
 from analysis import breakdown_tables, compare, error_tables, overview_table, resolved, summarize, target_table
+from make_references import ReferencesDisagree
 from methods import Method, StaleReference, Task, load_task, own_methods, stored_tasks
 from peers import find_peers
 from perception import flip, pattern_peak
@@ -90,7 +91,7 @@ def measure_all(
     for name in names:
         try:
             task = load_task(name, **reference)
-        except StaleReference as error:
+        except (ReferencesDisagree, StaleReference) as error:
             skipped[name] = str(error)
             continue
         prepared = []

@@ -195,6 +195,30 @@ def test_random_scenes_are_lit_and_seen():
         assert np.isfinite(picture).all()
 
 
+def test_references_are_pooled_by_their_noise_if_they_agree():
+    """Weighted by 1/variance, errors of 1 and 3 become 3 / √10, and a mean ten standard errors off is refused."""
+    from make_references import ReferencesDisagree, pooled_reference, relative_mse_floor
+
+    rng = np.random.default_rng(1)
+
+    def rendered(level, noise):
+        mean, error = level + noise * rng.standard_normal((64, 64, 3)), np.full((64, 64, 3), noise)
+        return {
+            "mean": mean,
+            "standard_error": error,
+            "floor": relative_mse_floor(np.full_like(mean, level), error),
+            "level_error": noise / np.sqrt(mean.size),
+        }
+
+    pooled = pooled_reference("box", {"one": rendered(10.0, 1.0), "other": rendered(10.0, 3.0)})
+    assert pooled["standard_error"] == pytest.approx(3.0 / np.sqrt(10.0), rel=1e-3)
+    # The deviation of n normal numbers is known to 1 / √(2n): 5 of these are 3.2 %.
+    assert np.std(pooled["mean"] - 10.0) == pytest.approx(3.0 / np.sqrt(10.0), rel=0.032)
+    off = 10.0 * np.hypot(1.0, 3.0) / 64.0 / np.sqrt(3.0)
+    with pytest.raises(ReferencesDisagree):
+        pooled_reference("box", {"one": rendered(10.0, 1.0), "other": rendered(10.0 + off, 3.0)})
+
+
 def test_patterns_stand_out_from_noise():
     """White noise has no peak; a tenth of its power in one frequency is one.
 
