@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, and how it ends."""
 
 import json
+import logging
 import math
 import os
 import re
@@ -18,7 +19,15 @@ import warp_ir.usd.load
 from warp_ir import RenderSettings
 from warp_ir.cli import compare, main
 from warp_ir.cli.arguments import parse, settings_of
-from warp_ir.cli.console import ProgressDisplay, describe_progress, say_warnings
+from warp_ir.cli.console import (
+    LOGGER,
+    Messages,
+    ProgressDisplay,
+    describe_progress,
+    say,
+    say_warnings,
+    show_result,
+)
 from warp_ir.cli.frames import outputs_of
 from warp_ir.image.io import AOV_CHANNELS, read_image
 from warp_ir.scene import InputError
@@ -708,13 +717,58 @@ def test_placeholders():
 
 def test_many_warnings_are_cut(capsys):
     """The first ten and how many more; the same one once; all if asked for, or if only one would be hidden."""
-    say_warnings([f"/Prim{i}: odd" for i in range(30)] * 2)
+    with Messages():
+        say_warnings([f"/Prim{i}: odd" for i in range(30)] * 2)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 11 and lines[-1] == "warp-ir: warning: ... and 20 more; --verbose shows all"
+        say_warnings([f"/Prim{i}: odd" for i in range(30)], everything=True)
+        assert len(capsys.readouterr().err.splitlines()) == 30
+        say_warnings([f"/Prim{i}: odd" for i in range(11)])
+        assert "/Prim10" in capsys.readouterr().err
+
+
+def test_log_file_has_everything(tmp_path, capsys):
+    """All warnings and results, in the order of their times, after what was there; -q hides them on stderr alone."""
+    log = tmp_path / "warp.log"
+    log.write_text("before\n")
+    with Messages() as messages:
+        messages.configure(quiet=True, file=str(log))
+        say_warnings([f"/Prim{i}:\nodd" for i in range(30)])
+        show_result("a.png: done", quiet=True)
+        say("failed", logging.ERROR)
+    first, *lines = log.read_text().splitlines()
+    stamps = [line[:23] for line in lines]
+    assert first == "before" and len(lines) == 32 and stamps == sorted(stamps)
+    assert [line.split(",")[1][4:] for line in lines[-3:]] == [
+        "WARNING /Prim29: odd", "INFO a.png: done", "ERROR failed"
+    ]  # fmt: skip
+    assert capsys.readouterr() == ("", "warp-ir: failed\n")
+    assert not LOGGER.handlers
+
+
+def test_log_file_of_a_command(tmp_path, capsys):
+    """It begins with the command, and a failure is in it with its traceback; one that cannot be written is an error."""
+    stage = tmp_path / "a.usda"
+    stage.write_text(DARK % "1")
+    assert main(["info", str(stage), "--log-file", str(tmp_path / "log"), "-q", "--camera", "/No"]) == 2
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert lines[0].endswith("-q --camera /No") and "ERROR error: " in lines[1]
+    capsys.readouterr()
+    message = error_of(capsys, "info", str(stage), "--log-file", str(tmp_path / "no" / "log"))
+    assert "--log-file: " in message and "No such file" in message
+
+
+def test_compiling_is_told_at_once_and_then_rarely(capsys, monkeypatch):
+    """The first line comes at once, further ones every five seconds at most, and the last one in any case."""
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with Messages():
+        for done in range(11):
+            now[0] = 2.0 * done
+            LOGGER.info("%d of 10", done, extra={"compiling": (done, 10)})
+        LOGGER.info("compiled")
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 11 and lines[-1] == "warp-ir: warning: ... and 20 more; --verbose shows all"
-    say_warnings([f"/Prim{i}: odd" for i in range(30)], everything=True)
-    assert len(capsys.readouterr().err.splitlines()) == 30
-    say_warnings([f"/Prim{i}: odd" for i in range(11)])
-    assert "/Prim10" in capsys.readouterr().err
+    assert lines == [f"warp-ir: {text}" for text in ("0 of 10", "3 of 10", "6 of 10", "9 of 10", "compiled")]
 
 
 class Step:
@@ -736,7 +790,7 @@ def test_progress_lines_become_rare(capsys, monkeypatch):
     """Without a terminal: lines after 10 s, 20 s more, 40 s more, ...: an hour is 8 lines."""
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with ProgressDisplay("a.png") as display:
+    with Messages(), ProgressDisplay("a.png") as display:
         for second in range(3600):
             now[0] = float(second)
             display(Step(second))
@@ -748,6 +802,9 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
     """On a terminal it is a bar, gone in the end."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
-    with ProgressDisplay("a.png") as display:
+    with Messages(), ProgressDisplay("a.png") as display:
+        LOGGER.info("compiling: 0 of 9", extra={"compiling": (0, 9)})
+        LOGGER.info("compiling: 8 of 9", extra={"compiling": (8, 9)})
         display(Step(3, 0.25, 7.0))
-    assert "a.png" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "a.png" in error and "compiling: 0 of 9" in error and "compiling: 8 of 9" not in error

@@ -75,11 +75,13 @@ class Renderer:
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
         estimator = ESTIMATORS[settings.estimator]
+        before = [*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *estimator.MODULES]
+        after = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
         with self.launcher.loading():
-            build = [warp_ir.bvh.build] if self.launcher.device.is_cpu else []
-            self.launcher.load([*build, *estimator.MODULES])  # what takes longest comes first
+            self.launcher.expect([*before, *after])
+            self.launcher.load(before)  # what takes longest comes first
             self._upload(scene)
-            self.launcher.load([*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES])
+            self.launcher.load(after)
 
     def update(self, scene: Scene) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.

@@ -145,6 +145,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
         more = "print all warnings, and tracebacks of errors"
         messages.add_argument("--verbose", "-v", action="store_true", help=more)
+        log = "file to which all messages are appended, with their times, even with --quiet"
+        messages.add_argument("--log-file", metavar="FILE", help=log)
     args, unknown = parser.parse_known_args(_join_aov_names(argv))
     if unknown:  # argparse itself would name the help of all commands
         raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")

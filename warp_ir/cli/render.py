@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 import math
 import os
 import platform
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint
-from warp_ir.cli.console import ProgressDisplay, say, say_warnings
+from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
@@ -133,7 +134,7 @@ def _products(job: _Job) -> list[_Picture]:
                 )
             name = Path(product.name)
             if name.suffix.lower() not in SUFFIXES:
-                say(f"warning: {product.path}: files of type {name.suffix!r} cannot be written; .exr is used")
+                warn(f"{product.path}: files of type {name.suffix!r} cannot be written; .exr is used")
                 name = name.with_suffix(".exr")
             if args.frames and "#" not in str(name) and folder / name in taken:
                 name = name.with_name(f"{name.stem}.####{name.suffix}")
@@ -167,9 +168,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
             for name in ("meshes", "lights")
         }
         job.previous_scene = scene
-        if not args.quiet:
-            say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
-            job.warned.update(scene.warnings)
+        say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
+        job.warned.update(scene.warnings)
         settings = settings_of(args, scene.settings)
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
@@ -231,8 +231,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     if settings.time_limit is not None and film.iterations == 1 and film.seconds > settings.time_limit:
         late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
         picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
-    if not args.quiet:
-        say_warnings(picture_warnings)
+    say_warnings(picture_warnings)
     _summarize(job, path, film, written=bool(written), blank=bool(blank))
     statistics = {
         "output": [str(file) for file in written],
@@ -294,18 +293,16 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     A blank picture says nothing about the light that its samples have missed: it has no estimated error.
     """
     if film.interrupted:
-        say("interrupted" if written else "interrupted before the first iteration: nothing written")
-    if not written or job.args.quiet:
+        message = "interrupted" if written else "interrupted before the first iteration: nothing written"
+        say(message, logging.ERROR)
+    if not written:
         return
     error = film.error()
     estimate = f", estimated error {100.0 * error:.2g} %" if math.isfinite(error) and not blank else ""
-    print(
-        f"{path}: {film.width} x {film.height}, {film.iterations} iterations in {film.seconds:.2f} s"
-        f" on {job.device}{estimate}",
-        flush=True,
-    )
+    summary = f"{path}: {film.width} x {film.height}, {film.iterations} iterations in {film.seconds:.2f} s"
+    show_result(f"{summary} on {job.device}{estimate}", quiet=job.args.quiet)
     if film.rejected:
-        say(f"warning: {film.rejected} non-finite samples were replaced")
+        warn(f"{film.rejected} non-finite samples were replaced")
     if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
