@@ -808,3 +808,92 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
         display(Step(3, 0.25, 7.0))
     error = capsys.readouterr().err
     assert "a.png" in error and "compiling: 0 of 9" in error and "compiling: 8 of 9" not in error
+
+
+# ---- presets and completion ------------------------------------------------------------------------------
+
+
+def preset(folder, text):
+    """A settings file."""
+    (folder / "preset.toml").write_text(text)
+    return str(folder / "preset.toml")
+
+
+def test_settings_file_stands_for_flags(tmp_path):
+    """Each key means what its flag means: numbers, switches, lists, texts, repeated flags."""
+    path = preset(
+        tmp_path,
+        """
+        res = [320, 200]
+        light-paths = 128
+        filter = false
+        denoise = false
+        data-window = [0, 0.25, 1, 1]
+        aov = ["depth", "normal"]
+        variant = ["/A{x=1}", "/B{y=2}"]
+        exposure = -1.5
+        float = true
+        camera = "/Cam"
+        """,
+    )
+    args = parse(["render", ROOM, "a.exr", "--settings", path])
+    settings = settings_of(args)
+    assert (settings.width, settings.height, settings.light_paths, settings.filter) == (320, 200, 128, False)
+    assert settings.data_window == (0.0, 0.25, 1.0, 1.0)
+    assert (args.aovs, args.variants, args.exposure) == (["depth", "normal"], ["/A{x=1}", "/B{y=2}"], -1.5)
+    assert args.half is False and args.camera == "/Cam" and args.stage == ROOM
+
+
+def test_command_line_wins_over_the_settings_file(tmp_path):
+    """A flag replaces the file's, and what belongs together: limits, sizes, times, cameras, lists."""
+    path = preset(
+        tmp_path, 'iterations = 8\nres = [320, 200]\nframes = "1:3"\ncamera = "/Cam"\naov = ["depth"]\nseed = 3\n'
+    )
+    command = ["render", ROOM, "a.exr", "--settings", path]
+    args = parse([*command, "-w64", "--time-limit=2", "--time", "5", "--eye", "0", "0", "-1", "--aov", "normal"])
+    settings = settings_of(args)
+    assert (settings.width, settings.height, settings.iterations, settings.time_limit) == (64, None, None, 2.0)
+    assert (args.frames, args.time, args.camera, args.eye) == (None, 5.0, None, [0.0, 0.0, -1.0])
+    assert args.aovs == ["normal"] and settings.seed == 3
+    assert settings_of(parse([*command, "--no-filter", "--seed", "4"])).seed == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("light_paths = 3", "'light_paths' is no flag of warp-ir render; did you mean 'light-paths'?"),
+        ("nonsense = 3", "'nonsense' is no flag of warp-ir render (see"),
+        ("settings = 'a'", "'settings' is no flag of"),
+        ("imageWidth = 3", "'imageWidth' is no flag of"),
+        ("[render]", "'render' is no flag of"),
+        ("width = 'wide'", "argument --width/-w: invalid int value: 'wide'"),
+        ("width = -2", "--width: must be a whole number of at least 1, is -2"),
+        ("width = true", "width: must be a number, a text or a list of these, is True"),
+        ("res = [1]", "argument --res: expected 2 arguments"),
+        ("filter = 3", "filter: must be true or false, is 3"),
+        ("width 3", "is not TOML: "),
+    ],
+)
+def test_settings_file_errors_name_the_file(tmp_path, capsys, text, message):
+    """What is wrong with a settings file is said in one line, with its name and the key."""
+    path = preset(tmp_path, text)
+    assert f"{path}: {message}" in error_of(capsys, "render", ROOM, "a.exr", "--settings", path)
+
+
+def test_settings_file_is_there(tmp_path, capsys):
+    """A missing file, a folder, and a flag of another command are errors."""
+    assert "no.toml: no such file" in error_of(capsys, "render", ROOM, "a.exr", "--settings", "no.toml")
+    assert "not a TOML file" in error_of(capsys, "render", ROOM, "a.exr", "--settings", str(tmp_path))
+    path = preset(tmp_path, "aov = 'depth'")
+    assert "'aov' is no flag of warp-ir compare" in error_of(capsys, "compare", ROOM, "--settings", path)
+
+
+def test_completion_knows_every_flag(capsys):
+    """The scripts for shells name the commands and their flags; an unknown shell is an error."""
+    pytest.importorskip("shtab")
+    for shell in ("bash", "zsh"):
+        with pytest.raises(SystemExit) as ended:
+            main(["--print-completion", shell])
+        script = capsys.readouterr().out
+        assert ended.value.code == 0 and "--light-paths" in script and "compare" in script
+    assert "must be one of bash" in error_of(capsys, "--print-completion", "cmd")
