@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 import warp_ir
@@ -29,6 +30,7 @@ from warp_ir.cli.console import (
     show_result,
 )
 from warp_ir.cli.frames import outputs_of
+from warp_ir.image.cryptomatte import float_id
 from warp_ir.image.io import AOV_CHANNELS, read_image
 from warp_ir.scene import InputError
 
@@ -808,6 +810,43 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
         display(Step(3, 0.25, 7.0))
     error = capsys.readouterr().err
     assert "a.png" in error and "compiling: 0 of 9" in error and "compiling: 8 of 9" not in error
+
+
+@pytest.mark.extended
+def test_exr_for_compositors(tmp_path):
+    """The flags for .exr arrive in the file, and the frame rate of the stage."""
+    stage = tmp_path / "a.usda"
+    stage.write_text((DARK % "1").replace("1.0", "1.0\n( framesPerSecond = 23.976 )", 1))
+    picture = tmp_path / "a.exr"
+    flags = ["--cryptomatte", "object,material", "--exr-parts", "many", "--exr-compression", "dwaa", "--owner", "Me"]
+    assert main(["render", str(stage), str(picture), *SMALL, *flags, "--aov", "prim_id"]) == 0
+    matte = read_image(picture, "crypto_object00")
+    assert set(np.unique(matte[..., 0])) == {0.0, np.float32(float_id("/Quad"))}
+    alpha = read_image(picture)[..., 3]
+    assert ((matte[..., 1] > 0.0) >= (alpha > 0.0)).all()  # the picture's camera rays are among those of the coverage
+    assert read_image(picture, "crypto_material02").shape[2] == 4
+    spec = oiio.ImageInput.open(str(picture)).spec()
+    assert tuple(spec.getattribute("framesPerSecond")) == (24000, 1001)
+    assert spec.getattribute("compression") == "dwaa" and json.loads(spec.getattribute("warp_ir:prim_names")) == [
+        "/Quad"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
+        ("a.png", ["--cryptomatte", "object"], "--cryptomatte: has no effect on"),
+        ("a.png", ["--owner", "Me"], "--owner: has no effect on"),
+        ("a.hdr", ["--exr-parts", "many"], "--exr-parts: has no effect on"),
+        ("a.tif", ["--exr-compression", "piz"], "--exr-compression: has no effect on"),
+        ("a.exr", ["--exr-compression", "lzw"], "argument --exr-compression: invalid choice"),
+        ("a.exr", ["--cryptomatte", "prim"], "unknown 'prim'; known are object, material"),
+        ("a.exr", ["--cryptomatte", "object", "--exr-compression", "dwab"], "add --exr-parts many"),
+    ],
+)
+def test_exr_flags_that_cannot_work(tmp_path, capsys, name, flags, message):
+    """Flags for .exr with another file, unknown values, and lossy numbers are errors."""
+    assert message in error_of(capsys, "render", ROOM, str(tmp_path / name), *flags)
 
 
 # ---- presets and completion ------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ def test_compiling_is_reported(monkeypatch, caplog):
             loader.load(module)
     assert [getattr(record, "compiling", None) for record in caplog.records] == [(0, 3), (1, 3), (2, 2), None]
     assert caplog.messages[0] == "compiling kernels, once: 0 of 3 modules done"
-    assert caplog.messages[-1].startswith("compiled 2 modules of kernels in ")
+    assert caplog.messages[-1].startswith("kernels compiled: 2 modules, ")
 
 
 def test_kernel_cache_is_known(launcher):

@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 from warp_ir import __version__
 from warp_ir.cli.toml_file import read_toml
+from warp_ir.image.cryptomatte import KINDS
+from warp_ir.image.exr import COMPRESSIONS
 from warp_ir.image.io import AOV_CHANNELS
 from warp_ir.image.tonemap import TONEMAPS
 from warp_ir.scene import InputError
@@ -348,6 +350,18 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
     )
+    output.add_argument(
+        "--exr-compression",
+        choices=COMPRESSIONS,
+        default=COMPRESSIONS[0],
+        metavar="NAME",
+        help=f"of .exr: {', '.join(COMPRESSIONS)}; dwaa and dwab lose digits of colours (default: {COMPRESSIONS[0]})",
+    )
+    parts = "store the layers of .exr as one part, or as a part for each (default: one)"
+    output.add_argument("--exr-parts", choices=("one", "many"), default="one", help=parts)
+    mattes = f"Cryptomattes in .exr, by {' or '.join(KINDS)}: coverage counted by 64 more camera rays per pixel"
+    output.add_argument("--cryptomatte", type=_names(KINDS), default=[], metavar="NAME[,NAME]", help=mattes)
+    output.add_argument("--owner", metavar="TEXT", help="whose picture it is, written to .exr")
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)

@@ -21,7 +21,8 @@ from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result,
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
-from warp_ir.cli.stage_options import open_reader, time_code_of
+from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
+from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
 from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
 from warp_ir.image.tonemap import suggest_exposure
 from warp_ir.scene import InputError, Scene
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     settings_of(args)
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
+    _check_exr_flags(args, into_folder)
     if not into_folder:
         outputs = outputs_of(args.output, args.frames, time_code_of(args))
         pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
@@ -112,6 +114,22 @@ def run(args: argparse.Namespace) -> int:
     if args.stats:
         _write_stats(Path(args.stats), job, imported, frames)
     return code
+
+
+def _check_exr_flags(args: argparse.Namespace, into_folder: bool) -> None:
+    """Raises `InputError` if flags for .exr are given for another file, or contradict each other."""
+    if args.cryptomatte and args.exr_compression in LOSSY and args.exr_parts == "one":
+        raise InputError(f"--exr-compression: {args.exr_compression} would change Cryptomattes; add --exr-parts many")
+    if into_folder or Path(args.output).suffix.lower() == ".exr":
+        return
+    given = {
+        "--exr-compression": args.exr_compression != COMPRESSIONS[0],
+        "--exr-parts": args.exr_parts != "one",
+        "--cryptomatte": bool(args.cryptomatte),
+        "--owner": args.owner is not None,
+    }
+    for flag in (flag for flag, is_given in given.items() if is_given):
+        raise InputError(f"{flag}: has no effect on {args.output}; name an .exr file")
 
 
 def _products(job: _Job) -> list[_Picture]:
@@ -205,6 +223,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
+        exr = _exr_options(job, picture)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             for file, aovs in picture.files.items():
@@ -216,6 +235,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                     tonemap=args.tonemap,
                     half=args.half,
                     metadata=metadata,
+                    exr=exr,
                 )
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
@@ -252,6 +272,20 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         "warnings": [*scene.warnings, *picture_warnings],
     }
     return statistics, code
+
+
+def _exr_options(job: _Job, picture: _Picture) -> ExrOptions:
+    """How the picture's EXR files are stored; traces the Cryptomattes if there is such a file."""
+    args = job.args
+    wanted = args.cryptomatte if any(file.suffix.lower() == ".exr" for file in picture.files) else []
+    assert job.renderer is not None
+    return ExrOptions(
+        compression=args.exr_compression,
+        multipart=args.exr_parts == "many",
+        cryptomattes=[matte for matte in job.renderer.cryptomattes() if matte.kind in wanted] if wanted else [],
+        owner=args.owner,
+        frames_per_second=frames_per_second(job.reader),
+    )
 
 
 def _blank_picture(scene: Scene, film: "Film") -> str:

@@ -46,6 +46,17 @@ def time_code_of(args: argparse.Namespace) -> TimeCode:
     return "default" if args.default_time else args.time
 
 
+def frames_per_second(reader: "StageReader") -> float | None:
+    """The rate at which the stage's frames are played, if it authors one that is possible."""
+    from pxr import Tf
+
+    try:
+        rate = float(reader.stage.GetFramesPerSecond()) if reader.stage.HasAuthoredMetadata("framesPerSecond") else 0.0
+    except Tf.ErrorException:  # stored with an unexpected type
+        return None
+    return rate if 0.0 < rate < 1.0e6 else None
+
+
 def stage_facts(reader: "StageReader", time: TimeCode = None) -> dict[str, Any]:
     """Up axis, unit, frames, cameras and render settings of a stage, as plain values for JSON.
 

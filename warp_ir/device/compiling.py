@@ -54,7 +54,7 @@ class ModuleLoader:
                 self._say("compiling kernels, once: %d of %d modules done")
             if self._began is not None and not self._expected:
                 seconds = time.perf_counter() - self._began
-                _LOGGER.info("compiled %d modules of kernels in %.1f s", self._compiled, seconds)
+                _LOGGER.info("kernels compiled: %d modules, %.1f s", self._compiled, seconds)
                 self._compiled, self._began = 0, None
 
     def _is_cached(self, module: Any) -> bool:
