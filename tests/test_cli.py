@@ -849,6 +849,39 @@ def test_exr_flags_that_cannot_work(tmp_path, capsys, name, flags, message):
     assert message in error_of(capsys, "render", ROOM, str(tmp_path / name), *flags)
 
 
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
+        ("a.png", ["--ocio-display", "CRT"], "no configuration; $OCIO or --ocio-config names one"),
+        ("a.png", ["--ocio-config", "ocio://default", "--ocio-display", "CRT"], "must be one of sRGB - Display, "),
+        ("a.png", ["--ocio-config", "ocio://default", "--ocio-view", "CRT"], "--ocio-view: must be one of "),
+        ("a.exr", ["--ocio-config", "ocio://default", "--ocio-view", "Raw"], "--ocio-view: has no effect on "),
+        ("a.png", ["--ocio-view", "Raw", "--tonemap", "filmic"], "takes the place of --tonemap"),
+        ("a.png", ["--ocio-config", "no.ocio"], "OpenColorIO: Requested non-existent OCIO config"),
+        ("a.exr", ["--color-space", "crayon"], "--color-space: must be one of lin_rec709_scene, "),
+        ("a.exr", ["--ocio-config", "ocio://default", "--color-space", "crayon"], "ACEScg, "),
+    ],
+)
+def test_colours_that_there_are_not(tmp_path, capsys, monkeypatch, name, flags, message):
+    """Unknown displays, views, spaces and configurations, and flags without effect, are one line; $OCIO stays."""
+    monkeypatch.delenv("OCIO", raising=False)
+    assert message in error_of(capsys, "render", ROOM, str(tmp_path / name), *flags)
+    assert "OCIO" not in os.environ
+
+
+@pytest.mark.extended
+def test_view_of_a_configuration(tmp_path, monkeypatch):
+    """The view that only encodes gives the picture of --tonemap srgb, in a settings file as well; steps of 8 bits."""
+    monkeypatch.delenv("OCIO", raising=False)
+    flags = ["--ocio-config", "ocio://default", "--ocio-view", "Un-tone-mapped"]
+    path = preset(tmp_path, 'ocio-config = "ocio://default"\ncolor-space = "Linear P3-D65"\nocio-view = "Raw"')
+    for name, more in (("a", []), ("b", flags), ("c", ["--settings", path])):
+        assert main(["render", ROOM, str(tmp_path / f"{name}.png"), *SMALL, *more]) == 0
+    pictures = [read_image(tmp_path / f"{name}.png") for name in "abc"]
+    np.testing.assert_allclose(pictures[1], pictures[0], atol=1.01 / 255.0)
+    assert np.abs(pictures[2] - pictures[0]).max() > 0.1
+
+
 # ---- presets and completion ------------------------------------------------------------------------------
 
 

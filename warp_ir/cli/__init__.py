@@ -23,6 +23,7 @@ from typing import NoReturn
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import LOGGER, Messages, say
 from warp_ir.image.io import check_input
+from warp_ir.image.ocio import use_config
 from warp_ir.scene import InputError
 
 _LOADED = time.perf_counter()
@@ -79,7 +80,8 @@ def _run(argv: Sequence[str], messages: Messages, started: float) -> int:
         LOGGER.debug("%s", shlex.join(["warp-ir", *argv]))
         check_input(args.stage, "a USD file")  # before anything is imported that takes time
         args.started = started
-        code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
+        with use_config(args.ocio_config):
+            code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
         sys.stdout.flush()
         return code
     except InputError as error:

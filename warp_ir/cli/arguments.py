@@ -17,6 +17,7 @@ from warp_ir.cli.toml_file import read_toml
 from warp_ir.image.cryptomatte import KINDS
 from warp_ir.image.exr import COMPRESSIONS
 from warp_ir.image.io import AOV_CHANNELS
+from warp_ir.image.ocio import use_config
 from warp_ir.image.tonemap import TONEMAPS
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
@@ -58,7 +59,7 @@ _TOGETHER: tuple[frozenset[str], ...] = (
 _NOT_IN_FILES = frozenset({"help", "settings"})
 _REPEATED = frozenset({"variants"})
 """Destinations of flags that may be repeated."""
-_FILES = ("stage", "output", "session_layer", "stats", "settings", "log_file")
+_FILES = ("stage", "output", "ocio_config", "session_layer", "stats", "settings", "log_file")
 """Destinations of arguments that are names of files."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
@@ -194,7 +195,9 @@ def _words_of_file(path: str, parser: argparse.ArgumentParser, given: Sequence[s
         kept += found if action.dest not in replaced else []
     positional = ["-" for action in parser._actions if not action.option_strings]
     try:  # here, so that the message names the file
-        settings_of(parser.parse_args([*positional, *words]))
+        parsed = parser.parse_args([*positional, *words])
+        with use_config(parsed.ocio_config):
+            settings_of(parsed)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return kept
@@ -344,9 +347,14 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
-        default=TONEMAPS[0],
         help="tone curve of these files: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
+    display = (
+        "OpenColorIO display for which these files are made, in place of the tone curve (default: --tonemap, sRGB)"
+    )
+    output.add_argument("--ocio-display", metavar="NAME", help=display)
+    view = "OpenColorIO view of that display (default: the display's first)"
+    output.add_argument("--ocio-view", metavar="NAME", help=view)
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
     )
@@ -513,6 +521,8 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         default="dome",
         help="light for a stage in which nothing emits (default: dome)",
     )
+    config = "OpenColorIO configuration, for textures and pictures: a file, or ocio://default (default: $OCIO)"
+    group.add_argument("--ocio-config", metavar="FILE", help=config)
     group.add_argument(
         "--metals",
         choices=("diffuse", "black"),

@@ -23,8 +23,9 @@ from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
 from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
-from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
-from warp_ir.image.tonemap import suggest_exposure
+from warp_ir.image.io import DISPLAYED, SUFFIXES, check_output, whole_file, write_image
+from warp_ir.image.ocio import check_view
+from warp_ir.image.tonemap import TONEMAPS, suggest_exposure
 from warp_ir.scene import InputError, Scene
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ class _Job:
     device: str
     versions: Mapping[str, str]
     reader: "StageReader"
+    view: tuple[str, str] | None
+    """OpenColorIO's display and view; None: pictures are tone-mapped."""
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
     write_seconds: float | None = None
@@ -76,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     _check_exr_flags(args, into_folder)
+    view = _view(args, into_folder)
     if not into_folder:
         outputs = outputs_of(args.output, args.frames, time_code_of(args))
         pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
@@ -91,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader)
+    job = _Job(args, device, versions, reader, view)
     if into_folder:
         pictures = _products(job)
 
@@ -130,6 +134,22 @@ def _check_exr_flags(args: argparse.Namespace, into_folder: bool) -> None:
     }
     for flag in (flag for flag, is_given in given.items() if is_given):
         raise InputError(f"{flag}: has no effect on {args.output}; name an .exr file")
+
+
+def _view(args: argparse.Namespace, into_folder: bool) -> tuple[str, str] | None:
+    """OpenColorIO's display and view that the flags choose; None: they do not.
+
+    Raises:
+        InputError: They do not exist, or have no effect.
+    """
+    if args.ocio_display is None and args.ocio_view is None:
+        return None
+    flag = "--ocio-view" if args.ocio_display is None else "--ocio-display"
+    if args.tonemap is not None:
+        raise InputError(f"{flag}: takes the place of --tonemap; give one of them")
+    if not into_folder and Path(args.output).suffix.lower() not in DISPLAYED:
+        raise InputError(f"{flag}: has no effect on {args.output}; name a file of type {', '.join(DISPLAYED)}")
+    return check_view(args.ocio_display, args.ocio_view)
 
 
 def _products(job: _Job) -> list[_Picture]:
@@ -232,7 +252,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                     film,
                     aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
                     exposure=args.exposure,
-                    tonemap=args.tonemap,
+                    tonemap=args.tonemap or TONEMAPS[0],
+                    view=job.view,
                     half=args.half,
                     metadata=metadata,
                     exr=exr,
@@ -337,7 +358,7 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     show_result(f"{summary} on {job.device}{estimate}", quiet=job.args.quiet)
     if film.rejected:
         warn(f"{film.rejected} non-finite samples were replaced")
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+    if path.suffix.lower() in DISPLAYED:
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
             brightness = "dark" if stops > job.args.exposure else "bright"

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.image.color_space import COLOR_SPACES, REC709, from_rec709
+from warp_ir.image.color_space import COLOR_SPACES, REC709
 from warp_ir.image.exr import ExrOptions, camera_matrices
+from warp_ir.image.ocio import active_config, check_color_space, display_values, to_color_space
 from warp_ir.image.tonemap import srgb_from_linear, tone_map
 from warp_ir.scene import InputError, Scene
 
@@ -38,17 +39,29 @@ AOV_CHANNELS = {
 }
 """Channels of an EXR file that hold the AOVs of a film; its radiance is in R, G and B."""
 
-SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DISPLAYED = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Extensions of pictures for a display: they are tone-mapped, or made by an OpenColorIO view."""
+SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", *DISPLAYED)
 """Extensions of the pictures that can be written."""
 
 _HALF_MAX = 65504.0
 _FULL_FLOAT_AOVS = frozenset({"position", "depth", "prim_id"})
 """AOVs that a half-float file stores with 32 bits: 11 bits of precision are too few for distances and indices."""
-_COLORS = frozenset({None, "direct", "indirect", "albedo"})
-"""AOVs that are colours; None stands for the radiance."""
+_LIGHT = frozenset({None, "direct", "indirect"})
+"""AOVs that are radiance; None stands for the whole."""
+_COLORS = _LIGHT | {"albedo"}
+"""AOVs that are colours."""
 
 
 _EXR = ExrOptions()
+
+
+class _Shown(NamedTuple):
+    """How linear radiance becomes display values; the arguments of `write_image`."""
+
+    exposure: float
+    tonemap: str
+    view: tuple[str, str] | None
 
 
 class _Layer(NamedTuple):
@@ -100,6 +113,7 @@ def write_image(
     *,
     exposure: float = 0.0,
     tonemap: str = "srgb",
+    view: tuple[str, str] | None = None,
     aov: str | None = None,
     aovs: Sequence[str] = (),
     half: bool = True,
@@ -116,14 +130,15 @@ def write_image(
             linear Rec. 709, row 0 at the top.
         exposure: Exposure [stops]; for `.png`, `.jpg` and `.tif` only.
         tonemap: "srgb" or "filmic"; for `.png`, `.jpg` and `.tif` only.
+        view: A display and its view in the OpenColorIO configuration that $OCIO names, in place of the tone curve.
         aov: Name of the film's AOV to write in place of its radiance.
         aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
             to a file of its own: picture.NAME.png for picture.png.
         half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped,
             with a warning that counts their pixels.
         metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
-        color_space: One of `COLOR_SPACES`, for colours in the linear formats; None: that of the film's settings, or
-            linear Rec. 709 for an array.
+        color_space: One of `COLOR_SPACES`, or a linear one of that configuration, for colours in the linear formats;
+            None: that of the film's settings, or linear Rec. 709 for an array.
         exr: How an EXR file is stored, and its Cryptomattes. Those of a film that a `Renderer` made have the camera's
             matrices; with the AOV prim_id, the attribute `warp_ir:prim_names` lists the names by their numbers.
 
@@ -137,21 +152,24 @@ def write_image(
     if color_space is None:
         settings = None if isinstance(source, np.ndarray) else source.settings
         color_space = REC709 if settings is None else settings.color_space
-    if color_space not in COLOR_SPACES:
-        raise InputError(f"{path}: no colour space {color_space!r}; known are {', '.join(COLOR_SPACES)}")
+    try:
+        check_color_space(color_space)
+    except InputError as error:
+        raise InputError(f"{path}: color_space: {error}") from None
     suffix = path.suffix.lower()
     if isinstance(source, np.ndarray) and (aov or aovs):
         raise InputError(f"{path}: an array has no AOVs; write a film")
     if suffix == ".exr":
         layers = _exr_layers(source, aov, aovs, color_space, exr)
         attributes = {**_attributes(source, metadata or {}), **exr.attributes(), **_view_attributes(source, aovs)}
-        attributes |= {"colorInteropID": color_space, "chromaticities": COLOR_SPACES[color_space]}
+        attributes |= _color_attributes(color_space)
         _write_exr(path, layers, half, attributes, exr, _data_window(source))
         return [path]
-    _write_single_layer(path, source, exposure, tonemap, aov, color_space)
+    shown = _Shown(exposure, tonemap, view)
+    _write_single_layer(path, source, shown, aov, color_space)
     aov_paths = [aov_path(path, name) for name in aovs]
     for name, other in zip(aovs, aov_paths, strict=True):
-        _write_single_layer(other, source, exposure, tonemap, name, color_space)
+        _write_single_layer(other, source, shown, name, color_space)
     return [path, *aov_paths]
 
 
@@ -317,7 +335,7 @@ def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | No
 
 def _linear(values: Array, aov: str | None, color_space: str) -> Array:
     """Values as linear formats store them: colours in the given colour space, others unchanged."""
-    return from_rec709(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
+    return to_color_space(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
 
 
 def _exr_layers(
@@ -342,6 +360,15 @@ def _exr_layers(
         channels = {name: (plane, True) for name, plane in matte.channels().items()}
         layers.append(_Layer(f"crypto_{matte.kind}", channels, False))
     return layers
+
+
+def _color_attributes(color_space: str) -> dict[str, Any]:
+    """What an EXR file says of its colour space."""
+    if color_space in COLOR_SPACES:
+        return {"colorInteropID": color_space, "chromaticities": COLOR_SPACES[color_space]}
+    config = active_config()
+    name = config.interop_id(color_space) if config is not None else ""
+    return {"colorInteropID": name} if name else {}
 
 
 def _view_attributes(source: "_Film | Array", aovs: Sequence[str]) -> dict[str, Any]:
@@ -428,9 +455,7 @@ def _exr_part(
     return spec, pixels
 
 
-def _write_single_layer(
-    path: Path, source: "_Film | Array", exposure: float, tonemap: str, aov: str | None, color_space: str
-) -> None:
+def _write_single_layer(path: Path, source: "_Film | Array", how: _Shown, aov: str | None, color_space: str) -> None:
     """Writes a file of a format without layers."""
     values, alpha = _pixels(source, aov)
     suffix = path.suffix.lower()
@@ -452,23 +477,26 @@ def _write_single_layer(
     if keeps_alpha and alpha is not None:
         # Stored unassociated. JPEG has no alpha: premultiplied colour is the picture over black.
         values = np.divide(values, alpha, out=np.zeros_like(values), where=alpha > 0.0)
-    shown = _display(values, aov, exposure, tonemap)
+    shown = _display(values, aov, how)
     if keeps_alpha and alpha is not None:
         shown = np.concatenate([shown, np.clip(alpha, 0.0, 1.0)], axis=-1)
     steps, stored = (65535.0, np.uint16) if suffix in (".tif", ".tiff") else (255.0, np.uint8)
     pixels = np.floor(shown * steps + 0.5).astype(stored)
     kind = oiio.UINT16 if stored == np.uint16 else oiio.UINT8
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec.set_colorspace("sRGB")
+    config = active_config() if how.view is not None and aov in _LIGHT else None
+    spec.set_colorspace("sRGB" if config is None or how.view is None else config.display_space(how.view))
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("Compression", "jpeg:95" if suffix in (".jpg", ".jpeg") else "zip")
     _save(path, [spec], [pixels])
 
 
-def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> Array:
+def _display(values: Array, aov: str | None, how: _Shown) -> Array:
     """Display values in [0, 1] of the radiance or an AOV."""
-    if aov in (None, "direct", "indirect"):
-        return tone_map(values, exposure, tonemap)
+    if aov in _LIGHT:
+        if how.view is None:
+            return tone_map(values, how.exposure, how.tonemap)
+        return display_values(np.broadcast_to(values, (*values.shape[:2], 3)), how.exposure, how.view)
     if aov == "albedo":
         return srgb_from_linear(values)
     low, high = 0.0, 1.0
