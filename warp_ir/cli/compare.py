@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp_ir as ir
 from warp_ir.cli.arguments import METHODS, settings_of
-from warp_ir.cli.console import ProgressDisplay, say, say_warnings, warn
+from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, time_code_of
 from warp_ir.image.io import check_output, whole_file
@@ -128,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     _warn_of_floor(rows, reference)
     if args.methods is None and len(methods) < len(METHODS):
         say("vpl denoised is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
-    print(recommendation_text(recommendation, max(row.time_limit for row in rows)), flush=True)
+    show_result(recommendation_text(recommendation, max(row.time_limit for row in rows)), quiet=False)
     title = f"{Path(args.stage).name}, {job.size[0]} x {job.size[1]}, on {device}"
     if picture is not None:
         with whole_file(picture) as temporary:

@@ -224,6 +224,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 checkpoint.write_if_due()
 
         begin = time.perf_counter()
+        exr = _exr_options(job, picture)  # before the render, so that its camera rays are within the time limit
         reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
         renderer.render(film, report, started=started, reserve=reserve)
         render_seconds = time.perf_counter() - begin
@@ -243,7 +244,6 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
-        exr = _exr_options(job, picture)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             for file, aovs in picture.files.items():

@@ -47,14 +47,15 @@ def time_code_of(args: argparse.Namespace) -> TimeCode:
 
 
 def frames_per_second(reader: "StageReader") -> float | None:
-    """The rate at which the stage's frames are played, if it authors one that is possible."""
-    from pxr import Tf
+    """The rate at which the stage's frames are played: its framesPerSecond, or else its timeCodesPerSecond.
 
-    try:
-        rate = float(reader.stage.GetFramesPerSecond()) if reader.stage.HasAuthoredMetadata("framesPerSecond") else 0.0
-    except Tf.ErrorException:  # stored with an unexpected type
-        return None
-    return rate if 0.0 < rate < 1.0e6 else None
+    None: it authors neither, or what no rate can be.
+    """
+    for name in ("framesPerSecond", "timeCodesPerSecond"):
+        if reader.stage.HasAuthoredMetadata(name):
+            rate = reader.stage.GetMetadata(name)
+            return float(rate) if isinstance(rate, int | float) and 0.0 < rate < 1.0e6 else None
+    return None
 
 
 def stage_facts(reader: "StageReader", time: TimeCode = None) -> dict[str, Any]:
