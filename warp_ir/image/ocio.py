@@ -19,9 +19,11 @@ from warp_ir.scene import InputError
 Array = npt.NDArray[np.floating]
 _VARIABLE = "OCIO"
 _AP0 = "lin_ap0_scene"
+_BRIGHTEST = 65504.0
+"""Largest value that is shown; in float32 matrices would spread a larger one over all channels."""
 _COMMON = (
-    *((name, REC709) for name in (REC709, "lin_rec709", "Linear Rec.709 (sRGB)", "Utility - Linear - sRGB")),
     *((name, _AP0) for name in ("aces_interchange", _AP0, "ACES2065-1", "ACES - ACES2065-1")),
+    *((name, REC709) for name in (REC709, "lin_rec709", "Linear Rec.709 (sRGB)", "Utility - Linear - sRGB")),
 )
 """Names, aliases and roles of colour spaces that configurations may have, and what they are called here."""
 
@@ -101,7 +103,7 @@ def display_values(radiance: Array, exposure: float, view: tuple[str, str]) -> n
         view: A display and one of its views, from `check_view`.
     """
     with np.errstate(over="ignore"):
-        exposed = np.asarray(radiance * 2.0**exposure, np.float32)
+        exposed = np.clip(radiance * 2.0**exposure, -_BRIGHTEST, _BRIGHTEST).astype(np.float32)
     return np.clip(_required_config().to_display(exposed, *view), 0.0, 1.0)
 
 
@@ -127,7 +129,11 @@ class OcioConfig:
         self._config = oiio.ColorConfig(path)
         if message := str(self._config.geterror()):
             raise InputError(f"OpenColorIO: {message.splitlines()[0]}")
-        common = next(((theirs, ours) for theirs, ours in _COMMON if self._has(theirs)), None)
+        spaces = self.spaces
+        aliases = (alias for space in spaces for alias in self._config.getAliases(space))
+        # OpenImageIO itself would guess what spaces of unknown names are.
+        self._known = {str(name).lower() for name in (*spaces, *aliases, *self._config.getRoles())}
+        common = next(((theirs, ours) for theirs, ours in _COMMON if self.has_space(theirs)), None)
         if common is None:
             raise InputError(
                 f"OpenColorIO: {path}: has no role aces_interchange, which would relate it to other spaces"
@@ -141,7 +147,7 @@ class OcioConfig:
 
     def has_space(self, name: str) -> bool:
         """Whether it has a colour space, alias or role of that name."""
-        return bool(name) and self._has(name)
+        return name.lower() in self._known
 
     def is_linear(self, name: str) -> bool:
         """Whether it has a linear colour space of that name."""
@@ -189,9 +195,6 @@ class OcioConfig:
         if view not in views:
             raise InputError(f"--ocio-view: must be one of {', '.join(views)}, is {view!r}")
         return display, view
-
-    def _has(self, name: str) -> bool:
-        return int(self._config.getColorSpaceIndex(str(self._config.resolve(name)))) >= 0
 
     def _converted(self, colors: Array, source: str, target: str) -> npt.NDArray[np.float32]:
         import OpenImageIO as oiio
