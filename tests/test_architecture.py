@@ -28,7 +28,7 @@ LAYERS = [
     ["surface"],
     ["lights"],
     ["gbuffer"],
-    ["film", "vpl"],
+    ["coverage", "film", "vpl"],
     ["guiding", "reconstruction", "scheduling"],
     ["estimators", "interrupt"],
     ["renderer"],

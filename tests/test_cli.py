@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, and how it ends."""
 
 import json
+import logging
 import math
 import os
 import re
@@ -11,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 import warp_ir
@@ -18,8 +20,17 @@ import warp_ir.usd.load
 from warp_ir import RenderSettings
 from warp_ir.cli import compare, main
 from warp_ir.cli.arguments import parse, settings_of
-from warp_ir.cli.console import ProgressDisplay, describe_progress, say_warnings
+from warp_ir.cli.console import (
+    LOGGER,
+    Messages,
+    ProgressDisplay,
+    describe_progress,
+    say,
+    say_warnings,
+    show_result,
+)
 from warp_ir.cli.frames import outputs_of
+from warp_ir.image.cryptomatte import float_id
 from warp_ir.image.io import AOV_CHANNELS, read_image
 from warp_ir.scene import InputError
 
@@ -708,13 +719,58 @@ def test_placeholders():
 
 def test_many_warnings_are_cut(capsys):
     """The first ten and how many more; the same one once; all if asked for, or if only one would be hidden."""
-    say_warnings([f"/Prim{i}: odd" for i in range(30)] * 2)
+    with Messages():
+        say_warnings([f"/Prim{i}: odd" for i in range(30)] * 2)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 11 and lines[-1] == "warp-ir: warning: ... and 20 more; --verbose shows all"
+        say_warnings([f"/Prim{i}: odd" for i in range(30)], everything=True)
+        assert len(capsys.readouterr().err.splitlines()) == 30
+        say_warnings([f"/Prim{i}: odd" for i in range(11)])
+        assert "/Prim10" in capsys.readouterr().err
+
+
+def test_log_file_has_everything(tmp_path, capsys):
+    """All warnings and results, in the order of their times, after what was there; -q hides them on stderr alone."""
+    log = tmp_path / "warp.log"
+    log.write_text("before\n")
+    with Messages() as messages:
+        messages.configure(quiet=True, file=str(log))
+        say_warnings([f"/Prim{i}:\nodd" for i in range(30)])
+        show_result("a.png: done", quiet=True)
+        say("failed", logging.ERROR)
+    first, *lines = log.read_text().splitlines()
+    stamps = [line[:23] for line in lines]
+    assert first == "before" and len(lines) == 32 and stamps == sorted(stamps)
+    assert [line.split(",")[1][4:] for line in lines[-3:]] == [
+        "WARNING /Prim29: odd", "INFO a.png: done", "ERROR failed"
+    ]  # fmt: skip
+    assert capsys.readouterr() == ("", "warp-ir: failed\n")
+    assert not LOGGER.handlers
+
+
+def test_log_file_of_a_command(tmp_path, capsys):
+    """It begins with the command, and a failure is in it with its traceback; one that cannot be written is an error."""
+    stage = tmp_path / "a.usda"
+    stage.write_text(DARK % "1")
+    assert main(["info", str(stage), "--log-file", str(tmp_path / "log"), "-q", "--camera", "/No"]) == 2
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert lines[0].endswith("-q --camera /No") and "ERROR error: " in lines[1]
+    capsys.readouterr()
+    message = error_of(capsys, "info", str(stage), "--log-file", str(tmp_path / "no" / "log"))
+    assert "--log-file: " in message and "No such file" in message
+
+
+def test_compiling_is_told_at_once_and_then_rarely(capsys, monkeypatch):
+    """The first line comes at once, further ones every five seconds at most, and the last one in any case."""
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with Messages():
+        for done in range(11):
+            now[0] = 2.0 * done
+            LOGGER.info("%d of 10", done, extra={"compiling": (done, 10)})
+        LOGGER.info("compiled")
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 11 and lines[-1] == "warp-ir: warning: ... and 20 more; --verbose shows all"
-    say_warnings([f"/Prim{i}: odd" for i in range(30)], everything=True)
-    assert len(capsys.readouterr().err.splitlines()) == 30
-    say_warnings([f"/Prim{i}: odd" for i in range(11)])
-    assert "/Prim10" in capsys.readouterr().err
+    assert lines == [f"warp-ir: {text}" for text in ("0 of 10", "3 of 10", "6 of 10", "9 of 10", "compiled")]
 
 
 class Step:
@@ -736,7 +792,7 @@ def test_progress_lines_become_rare(capsys, monkeypatch):
     """Without a terminal: lines after 10 s, 20 s more, 40 s more, ...: an hour is 8 lines."""
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with ProgressDisplay("a.png") as display:
+    with Messages(), ProgressDisplay("a.png") as display:
         for second in range(3600):
             now[0] = float(second)
             display(Step(second))
@@ -748,6 +804,168 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
     """On a terminal it is a bar, gone in the end."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
-    with ProgressDisplay("a.png") as display:
+    with Messages(), ProgressDisplay("a.png") as display:
+        LOGGER.info("compiling: 0 of 9", extra={"compiling": (0, 9)})
+        LOGGER.info("compiling: 8 of 9", extra={"compiling": (8, 9)})
         display(Step(3, 0.25, 7.0))
-    assert "a.png" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "a.png" in error and "compiling: 0 of 9" in error and "compiling: 8 of 9" not in error
+
+
+@pytest.mark.extended
+def test_exr_for_compositors(tmp_path):
+    """The flags for .exr arrive in the file, and the frame rate of the stage."""
+    stage = tmp_path / "a.usda"
+    stage.write_text((DARK % "1").replace("1.0", "1.0\n( framesPerSecond = 23.976 )", 1))
+    picture = tmp_path / "a.exr"
+    flags = ["--cryptomatte", "object,material", "--exr-parts", "many", "--exr-compression", "dwaa", "--owner", "Me"]
+    assert main(["render", str(stage), str(picture), *SMALL, *flags, "--aov", "prim_id"]) == 0
+    matte = read_image(picture, "crypto_object00")
+    assert set(np.unique(matte[..., 0])) == {0.0, np.float32(float_id("/Quad"))}
+    alpha = read_image(picture)[..., 3]
+    assert ((matte[..., 1] > 0.0) >= (alpha > 0.0)).all()  # the picture's camera rays are among those of the coverage
+    assert read_image(picture, "crypto_material02").shape[2] == 4
+    spec = oiio.ImageInput.open(str(picture)).spec()
+    assert tuple(spec.getattribute("framesPerSecond")) == (24000, 1001)
+    assert spec.getattribute("compression") == "dwaa" and json.loads(spec.getattribute("warp_ir:prim_names")) == [
+        "/Quad"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
+        ("a.png", ["--cryptomatte", "object"], "--cryptomatte: has no effect on"),
+        ("a.png", ["--owner", "Me"], "--owner: has no effect on"),
+        ("a.hdr", ["--exr-parts", "many"], "--exr-parts: has no effect on"),
+        ("a.tif", ["--exr-compression", "piz"], "--exr-compression: has no effect on"),
+        ("a.exr", ["--exr-compression", "lzw"], "argument --exr-compression: invalid choice"),
+        ("a.exr", ["--cryptomatte", "prim"], "unknown 'prim'; known are object, material"),
+        ("a.exr", ["--cryptomatte", "object", "--exr-compression", "dwab"], "add --exr-parts many"),
+    ],
+)
+def test_exr_flags_that_cannot_work(tmp_path, capsys, name, flags, message):
+    """Flags for .exr with another file, unknown values, and lossy numbers are errors."""
+    assert message in error_of(capsys, "render", ROOM, str(tmp_path / name), *flags)
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
+        ("a.png", ["--ocio-display", "CRT"], "no configuration; $OCIO or --ocio-config names one"),
+        ("a.png", ["--ocio-config", "ocio://default", "--ocio-display", "CRT"], "must be one of sRGB - Display, "),
+        ("a.png", ["--ocio-config", "ocio://default", "--ocio-view", "CRT"], "--ocio-view: must be one of "),
+        ("a.exr", ["--ocio-config", "ocio://default", "--ocio-view", "Raw"], "--ocio-view: has no effect on "),
+        ("a.png", ["--ocio-view", "Raw", "--tonemap", "filmic"], "takes the place of --tonemap"),
+        ("a.png", ["--ocio-config", "no.ocio"], "OpenColorIO: Requested non-existent OCIO config"),
+        ("a.exr", ["--color-space", "crayon"], "--color-space: must be one of lin_rec709_scene, "),
+        ("a.exr", ["--ocio-config", "ocio://default", "--color-space", "crayon"], "ACEScg, "),
+    ],
+)
+def test_colours_that_there_are_not(tmp_path, capsys, monkeypatch, name, flags, message):
+    """Unknown displays, views, spaces and configurations, and flags without effect, are one line; $OCIO stays."""
+    monkeypatch.delenv("OCIO", raising=False)
+    assert message in error_of(capsys, "render", ROOM, str(tmp_path / name), *flags)
+    assert "OCIO" not in os.environ
+
+
+@pytest.mark.extended
+def test_view_of_a_configuration(tmp_path, monkeypatch):
+    """The view that only encodes gives the picture of --tonemap srgb, in a settings file as well; steps of 8 bits."""
+    monkeypatch.delenv("OCIO", raising=False)
+    flags = ["--ocio-config", "ocio://default", "--ocio-view", "Un-tone-mapped"]
+    path = preset(tmp_path, 'ocio-config = "ocio://default"\ncolor-space = "Linear P3-D65"\nocio-view = "Raw"')
+    for name, more in (("a", []), ("b", flags), ("c", ["--settings", path])):
+        assert main(["render", ROOM, str(tmp_path / f"{name}.png"), *SMALL, *more]) == 0
+    pictures = [read_image(tmp_path / f"{name}.png") for name in "abc"]
+    np.testing.assert_allclose(pictures[1], pictures[0], atol=1.01 / 255.0)
+    assert np.abs(pictures[2] - pictures[0]).max() > 0.1
+
+
+# ---- presets and completion ------------------------------------------------------------------------------
+
+
+def preset(folder, text):
+    """A settings file."""
+    (folder / "preset.toml").write_text(text)
+    return str(folder / "preset.toml")
+
+
+def test_settings_file_stands_for_flags(tmp_path):
+    """Each key means what its flag means: numbers, switches, lists, texts, repeated flags."""
+    path = preset(
+        tmp_path,
+        """
+        res = [320, 200]
+        light-paths = 128
+        filter = false
+        denoise = false
+        data-window = [0, 0.25, 1, 1]
+        aov = ["depth", "normal"]
+        variant = ["/A{x=1}", "/B{y=2}"]
+        exposure = -1.5
+        float = true
+        camera = "/Cam"
+        """,
+    )
+    args = parse(["render", ROOM, "a.exr", "--settings", path])
+    settings = settings_of(args)
+    assert (settings.width, settings.height, settings.light_paths, settings.filter) == (320, 200, 128, False)
+    assert settings.data_window == (0.0, 0.25, 1.0, 1.0)
+    assert (args.aovs, args.variants, args.exposure) == (["depth", "normal"], ["/A{x=1}", "/B{y=2}"], -1.5)
+    assert args.half is False and args.camera == "/Cam" and args.stage == ROOM
+
+
+def test_command_line_wins_over_the_settings_file(tmp_path):
+    """A flag replaces the file's, and what belongs together: limits, sizes, times, cameras, lists."""
+    path = preset(
+        tmp_path, 'iterations = 8\nres = [320, 200]\nframes = "1:3"\ncamera = "/Cam"\naov = ["depth"]\nseed = 3\n'
+    )
+    command = ["render", ROOM, "a.exr", "--settings", path]
+    args = parse([*command, "-w64", "--time-limit=2", "--time", "5", "--eye", "0", "0", "-1", "--aov", "normal"])
+    settings = settings_of(args)
+    assert (settings.width, settings.height, settings.iterations, settings.time_limit) == (64, None, None, 2.0)
+    assert (args.frames, args.time, args.camera, args.eye) == (None, 5.0, None, [0.0, 0.0, -1.0])
+    assert args.aovs == ["normal"] and settings.seed == 3
+    assert settings_of(parse([*command, "--no-filter", "--seed", "4"])).seed == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("light_paths = 3", "'light_paths' is no flag of warp-ir render; did you mean 'light-paths'?"),
+        ("nonsense = 3", "'nonsense' is no flag of warp-ir render (see"),
+        ("settings = 'a'", "'settings' is no flag of"),
+        ("imageWidth = 3", "'imageWidth' is no flag of"),
+        ("[render]", "'render' is no flag of"),
+        ("width = 'wide'", "argument --width/-w: invalid int value: 'wide'"),
+        ("width = -2", "--width: must be a whole number of at least 1, is -2"),
+        ("width = true", "width: must be a number, a text or a list of these, is True"),
+        ("res = [1]", "argument --res: expected 2 arguments"),
+        ("filter = 3", "filter: must be true or false, is 3"),
+        ("width 3", "is not TOML: "),
+    ],
+)
+def test_settings_file_errors_name_the_file(tmp_path, capsys, text, message):
+    """What is wrong with a settings file is said in one line, with its name and the key."""
+    path = preset(tmp_path, text)
+    assert f"{path}: {message}" in error_of(capsys, "render", ROOM, "a.exr", "--settings", path)
+
+
+def test_settings_file_is_there(tmp_path, capsys):
+    """A missing file, a folder, and a flag of another command are errors."""
+    assert "no.toml: no such file" in error_of(capsys, "render", ROOM, "a.exr", "--settings", "no.toml")
+    assert "not a TOML file" in error_of(capsys, "render", ROOM, "a.exr", "--settings", str(tmp_path))
+    path = preset(tmp_path, "aov = 'depth'")
+    assert "'aov' is no flag of warp-ir compare" in error_of(capsys, "compare", ROOM, "--settings", path)
+
+
+def test_completion_knows_every_flag(capsys):
+    """The scripts for shells name the commands and their flags; an unknown shell is an error."""
+    pytest.importorskip("shtab")
+    for shell in ("bash", "zsh"):
+        with pytest.raises(SystemExit) as ended:
+            main(["--print-completion", shell])
+        script = capsys.readouterr().out
+        assert ended.value.code == 0 and "--light-paths" in script and "compare" in script
+    assert "must be one of bash" in error_of(capsys, "--print-completion", "cmd")

@@ -8,8 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_ir as ir
+from warp_ir.device.launcher import Launcher
 from warp_ir.procedural import cornell_box, furnace
 from warp_ir.renderer import Renderer
 
@@ -244,3 +246,68 @@ def test_change_between_pictures_is_their_noise():
     kept = noise.updated(pictures[4], np.array([4], np.int32))
     np.testing.assert_array_equal(kept.variance, noise.variance)
     assert np.isnan(PictureNoise.first(pictures[1], np.array([1], np.int32)).squared_errors(np.array([1]))).all()
+
+
+def test_pictures_without_a_copy(device):
+    """`out` gets the bits of `radiance`, in NumPy's, Warp's and DLPack's memory, of the mean and of the filter."""
+    for settings in (SETTINGS, replace(SETTINGS, filter=True)):
+        film = ir.render(cornell_box(), settings, device=device)
+        expected = film.radiance()
+        array = wp.zeros((8, 12, 3), dtype=wp.float32, device=device)
+        assert film.radiance(out=array) is array
+        np.testing.assert_array_equal(array.numpy(), expected)
+        own = film.to_warp()
+        assert str(own.device) == device and own.shape == (8, 12, 3) and own.ptr != film.to_warp().ptr
+        np.testing.assert_array_equal(own.numpy(), expected)
+        np.testing.assert_array_equal(wp.from_dlpack(film).numpy(), expected)
+        film.merge(film)
+        np.testing.assert_array_equal(own.numpy(), expected)  # it is the caller's
+
+
+def test_dlpack_and_numpy_on_the_host():
+    """NumPy takes films by DLPack and gives memory to write to; a tensor too, where PyTorch is installed."""
+    film = ir.render(cornell_box(), SETTINGS)
+    expected = film.radiance()
+    assert film.__dlpack_device__() == (1, 0)  # kDLCPU
+    np.testing.assert_array_equal(np.from_dlpack(film), expected)
+    stack = np.zeros((2, 8, 12, 3), np.float32)
+    assert film.radiance(out=stack[1]).base is stack
+    np.testing.assert_array_equal(stack, [0.0 * expected, expected])
+    with pytest.raises(BufferError, match="made anew"):
+        film.__dlpack__(copy=False)
+    with pytest.raises(BufferError, match="on cpu"):
+        film.__dlpack__(dl_device=(2, 0))
+
+
+def test_tensors():
+    """A tensor of PyTorch is written to in place, and made from a film."""
+    torch = pytest.importorskip("torch")
+    film = ir.render(cornell_box(), SETTINGS)
+    tensor = torch.zeros(8, 12, 3)
+    assert film.radiance(out=tensor) is tensor
+    np.testing.assert_array_equal(tensor.numpy(), film.radiance())
+    np.testing.assert_array_equal(torch.from_dlpack(film).numpy(), film.radiance())
+
+
+_FROZEN = np.zeros((8, 12, 3), np.float32)
+_FROZEN.flags.writeable = False
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        np.zeros((8, 12, 3)),
+        np.zeros((12, 8, 3), np.float32),
+        np.zeros((3, 12, 8), np.float32).T,
+        np.zeros((8, 24, 3), np.float32)[:, ::2],
+        _FROZEN,
+        [[0.0]],
+        wp.zeros((8, 12), dtype=wp.float32, device="cpu"),
+        wp.zeros((8, 24, 3), dtype=wp.float32, device="cpu")[:, ::2],
+    ],
+)
+def test_places_that_cannot_be_written_to(out):
+    """Another type, shape or layout, memory that is read-only, and what is no array are refused in one line."""
+    film = ir.Film(12, 8, Launcher("cpu"))
+    with pytest.raises(ir.InputError, match=r"out: must be a C-contiguous float32 array \[8, 12, 3\] on cpu"):
+        film.radiance(out=out)

@@ -1,18 +1,23 @@
 """Pictures on disk: what was written is what is read, whole or not at all."""
 
+import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 from pxr import Gf
 
-from warp_ir import InputError, RenderSettings
+from warp_ir import Camera, InputError, Projection, RenderSettings, Scene
 from warp_ir.image.color_space import COLOR_SPACES, REC709, matrix
+from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions, frame_rate
 from warp_ir.image.io import AOV_CHANNELS, check_output, read_image, whole_file, write_image
 from warp_ir.image.tonemap import srgb_from_linear
+from warp_ir.procedural import cornell_box
 
 HEIGHT, WIDTH = 5, 7
 
@@ -23,6 +28,7 @@ class FakeFilm:
     width, height = WIDTH, HEIGHT
     iterations, seconds, interrupted, rejected = 3, 0.5, False, 0
     settings = RenderSettings(width=WIDTH, height=HEIGHT)
+    origin = None
 
     def __init__(self):
         rng = np.random.default_rng(3)
@@ -142,7 +148,7 @@ def test_screens_show_the_same_in_any_colour_space(tmp_path, film):
         write_image(tmp_path / f"{name}.png", film, color_space=name)
     one, other = (read_image(tmp_path / f"{name}.png") for name in (REC709, "lin_ap1_scene"))
     np.testing.assert_array_equal(one, other)
-    with pytest.raises(InputError, match="no colour space 'crayon'; known are lin_rec709_scene"):
+    with pytest.raises(InputError, match=r"color_space: must be one of lin_rec709_scene, .*, is 'crayon'"):
         write_image(tmp_path / "a.exr", film, color_space="crayon")
 
 
@@ -285,3 +291,84 @@ def test_names_are_the_films():
     from warp_ir import Film
 
     assert set(AOV_CHANNELS) == set(Film.AOV_NAMES)
+
+
+def test_matrices_of_the_camera(tmp_path, film):
+    """Camera space has z forwards, NDC lead to (0, 0) in the upper left and (1, 1) in the lower right corner.
+
+    For row vectors; both projections, and a picture whose window is wider than the camera's.
+    """
+    camera = Camera.look_at((1.0, 2.0, 3.0), (0.0, 1.0, -2.0), fov=40.0, aspect=1.0)
+    settings = RenderSettings(width=WIDTH, height=HEIGHT)
+    film.settings = settings
+    for projection in Projection:
+        film.origin = Scene(camera=replace(camera, projection=projection, clipping=(0.5, 1000.0)))
+        write_image(tmp_path / "a.exr", film)
+        spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
+        to_camera, to_ndc = (np.reshape(spec.getattribute(name), (4, 4)) for name in ("worldToCamera", "worldToNDC"))
+        left, right, bottom, top = film.origin.camera.fit(WIDTH, HEIGHT).window
+        for x, y, corner in ((left, top, (0, 0)), (right, bottom, (1, 1)), (left, bottom, (0, 1))):
+            depth = 7.0
+            scale = depth if projection == Projection.PERSPECTIVE else 1.0
+            world = camera.world_from_camera @ [x * scale, y * scale, -depth, 1.0]
+            np.testing.assert_allclose(world @ to_camera, [x * scale, y * scale, depth, 1.0], atol=1e-5)
+            ndc = world @ to_ndc
+            np.testing.assert_allclose((ndc / ndc[3])[:2], corner, atol=1e-5)
+        near = camera.world_from_camera @ [0.0, 0.0, -0.5, 1.0]
+        np.testing.assert_allclose((near @ to_ndc)[2], 0.0, atol=1e-5)
+
+
+def test_names_of_prims_are_in_the_file(tmp_path, film):
+    """With prim_id the file tells which numbers are which meshes; without it, it does not."""
+    film.origin = cornell_box()
+    names = [mesh.name for mesh in film.origin.meshes]
+    for aovs, wanted in ((("prim_id",), names), ((), None)):
+        write_image(tmp_path / "a.exr", film, aovs=aovs)
+        found = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec().getattribute("warp_ir:prim_names")
+        assert (found and json.loads(found)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("rate", "fraction"),
+    [(24.0, (24, 1)), (23.976, (24000, 1001)), (29.97, (30000, 1001)), (59.94, (60000, 1001)), (12.5, (25, 2))],
+)
+def test_frame_rates_are_exact(tmp_path, film, rate, fraction):
+    """The rates of NTSC are written as decimals, and mean 24000/1001, 30000/1001, ..."""
+    options = ExrOptions(frames_per_second=rate, owner="Studio")
+    write_image(tmp_path / "a.exr", film, exr=options)
+    spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
+    assert frame_rate(rate) == Fraction(*fraction)
+    assert tuple(spec.getattribute("framesPerSecond")) == fraction
+    assert b"framesPerSecond\0rational\0" in (tmp_path / "a.exr").read_bytes()
+    assert b"owner\0string\0\6\0\0\0Studio" in (tmp_path / "a.exr").read_bytes()
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("multipart", [False, True])
+def test_compression_and_parts(tmp_path, film, compression, multipart):
+    """The file has the compression and the parts that were asked for; what is no colour loses nothing."""
+    path = tmp_path / "a.exr"
+    options = ExrOptions(compression=compression, multipart=multipart)
+    write_image(path, film, aovs=("depth", "position", "prim_id", "albedo"), exr=options)
+    file = oiio.ImageInput.open(str(path))
+    parts = []
+    while file.seek_subimage(len(parts), 0):
+        spec = file.spec()
+        parts.append((spec.getattribute("oiio:subimagename"), spec.getattribute("compression")))
+    file.geterror()
+    lossless = "zip" if compression in LOSSY else compression
+    many = [("rgba", compression), *((name, lossless) for name in ("depth", "position", "prim_id"))]
+    assert parts == ([*many, ("albedo", compression)] if multipart else [(None, compression)])
+    for name in ("depth", "position", "prim_id"):
+        wanted = film.aov(name).reshape(HEIGHT, WIDTH, -1)
+        np.testing.assert_array_equal(read_image(path, name), wanted)
+    np.testing.assert_allclose(read_image(path)[..., :3], film.radiance(), atol=0.1 if compression in LOSSY else 1e-3)
+    assert read_image(path).shape[2] == 4
+
+
+def test_bad_options_are_one_line():
+    """Unknown compressions and rates that are none."""
+    with pytest.raises(InputError, match="compression: must be one of zip, zips"):
+        ExrOptions(compression="lzw")
+    with pytest.raises(InputError, match="frames_per_second: must be a positive number"):
+        ExrOptions(frames_per_second=0.0)

@@ -1,10 +1,15 @@
 """Kernels on many threads: the same result, and an end when asked."""
 
+import logging
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
 
+from warp_ir.device.compiling import ModuleLoader
 from warp_ir.device.launcher import Cancelled, Launcher
+from warp_ir.film import accumulate
 from warp_ir.scene import InputError
 
 wp.set_module_options({"enable_backward": False})
@@ -100,3 +105,32 @@ def test_unknown_device_is_named():
     """A device that is not there is an input error that lists those that are."""
     with pytest.raises(InputError, match=r"cuda:99.*available: cpu"):
         Launcher("cuda:99")
+
+
+def test_compiling_is_reported(monkeypatch, caplog):
+    """What the kernel cache lacks is reported when it begins, after each module, and in the end; the rest is silent."""
+    monkeypatch.setattr(wp, "load_module", lambda *_, **__: None)
+    monkeypatch.setattr(ModuleLoader, "_is_cached", lambda self, module: module.startswith("cached"))
+    loader = ModuleLoader(wp.get_device("cpu"), 64)
+    with caplog.at_level(logging.INFO, "warp_ir"):
+        loader.load("cached 1")
+        assert not caplog.records
+        loader.expect(["cached 2", "new 1", "new 2"])
+        for module in ("new 1", "cached 2", "new 2", "new 1"):
+            loader.load(module)
+    assert [getattr(record, "compiling", None) for record in caplog.records] == [(0, 3), (1, 3), (2, 2), None]
+    assert caplog.messages[0] == "compiling kernels, once: 0 of 3 modules done"
+    assert caplog.messages[-1].startswith("kernels compiled: 2 modules, ")
+
+
+def test_kernel_cache_is_known(launcher):
+    """A module that has been loaded lies in the cache where the loader looks for it; one with another text does not."""
+    loader = ModuleLoader(launcher.device, 64)
+    launcher.load([accumulate])
+    module = wp.get_module(accumulate.__name__)
+    assert loader._is_cached(module)
+    other = SimpleNamespace(
+        get_module_identifier=lambda block_dim: module.get_module_identifier(block_dim) + "0",
+        _get_compile_output_name=module._get_compile_output_name,
+    )
+    assert not loader._is_cached(other)

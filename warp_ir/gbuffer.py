@@ -149,6 +149,14 @@ def _clip_interval(camera: CameraData, ray: Ray) -> wp.vec2:
 
 
 @wp.func
+def first_hit(scene: SceneData, camera: CameraData, ray: Ray) -> Hit:
+    """The surface that a camera ray hits between the clipping range and planes."""
+    interval = _clip_interval(camera, ray)
+    near = interval[0]
+    return closest(scene, ray.origin + ray.direction * near, ray.direction, interval[1] - near)
+
+
+@wp.func
 def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHit:
     """Traces a camera ray, and evaluates the surface that it hits."""
     interval = _clip_interval(camera, ray)

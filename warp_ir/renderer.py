@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import warp as wp
 
 import warp_ir.bvh.build
+from warp_ir.coverage import SAMPLES, measure_coverage
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_scenes
@@ -26,6 +27,7 @@ from warp_ir.estimators import ESTIMATORS, Estimator
 from warp_ir.film import ACCUMULATE_MODULES, Film
 from warp_ir.film.denoise import denoise_seconds
 from warp_ir.gbuffer import GBuffer, new_gbuffer
+from warp_ir.image.cryptomatte import Cryptomatte
 from warp_ir.interrupt import cancel_on_signal
 from warp_ir.memory import pixel_bytes
 from warp_ir.reconstruction import BLUR_MODULES, FILTER_MODULES, SCRATCH, Reconstruction, surfaces_move
@@ -75,11 +77,13 @@ class Renderer:
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
         estimator = ESTIMATORS[settings.estimator]
+        before = [*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *estimator.MODULES]
+        after = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
         with self.launcher.loading():
-            build = [warp_ir.bvh.build] if self.launcher.device.is_cpu else []
-            self.launcher.load([*build, *estimator.MODULES])  # what takes longest comes first
+            self.launcher.expect([*before, *after])
+            self.launcher.load(before)  # what takes longest comes first
             self._upload(scene)
-            self.launcher.load([*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES])
+            self.launcher.load(after)
 
     def update(self, scene: Scene) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.
@@ -198,6 +202,17 @@ class Renderer:
         film.seconds = time.perf_counter() - start
         self._report_profile(film)
         return film
+
+    def cryptomattes(self) -> tuple[Cryptomatte, Cryptomatte]:
+        """Which objects, by the names of their meshes, and which materials cover each pixel, and how much of it.
+
+        Counted by the camera rays of the first 64 iterations, which are traced for it, however many a film has.
+        """
+        with self.launcher.exclusive, self.launcher.phase("coverage"), self.launcher.uninterruptible():
+            shift = len(self._shutter).bit_length() - 1
+            numbers = [stratum(iteration, shift) for iteration in range(SAMPLES)]
+            shutter = [(state.scene, state.camera) for state in self._shutter]
+            return measure_coverage(shutter, numbers, self.settings.seed, self.launcher)
 
     def _take_settings(self, scene: Scene) -> None:
         """Fills in the settings that depend on the scene's camera, and refuses pictures too large for the memory."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from warp_ir.image.color_space import COLOR_SPACES, REC709
+from warp_ir.image.ocio import check_color_space
 from warp_ir.scene import CONFORM_POLICIES, InputError
 
 ESTIMATOR_NAMES = ("vpl", "keller", "path")
@@ -78,9 +79,9 @@ class RenderSettings:
     visible_lights: bool = _setting(False, "show area lights and the dome to the camera")
     color_space: str = _setting(
         REC709,
-        "colour space of linear pictures (.exr, .hdr, .pfm, .npy); lin_ap1_scene is ACEScg. Light is computed in"
-        " linear Rec. 709, and what is tone-mapped is sRGB in any case",
-        tuple(COLOR_SPACES),
+        f"colour space of linear pictures (.exr, .hdr, .pfm, .npy): {', '.join(COLOR_SPACES)}, or a linear one of the"
+        " OpenColorIO configuration that $OCIO names; lin_ap1_scene is ACEScg. Light is computed in linear Rec. 709;"
+        " what is tone-mapped is sRGB in any case",
     )
     seed: int = _setting(0, "seed of the random scrambling; the same seed gives the same bits")
 
@@ -97,7 +98,10 @@ class RenderSettings:
         self._check("bound_radius", self.bound_radius == 0 or _positive(self.bound_radius), "a number of at least 0")
         self._check("pixel_aspect", _positive(self.pixel_aspect), "a positive number")
         self._check("conform", self.conform in CONFORM_POLICIES, f"one of {', '.join(CONFORM_POLICIES)}")
-        self._check("color_space", self.color_space in COLOR_SPACES, f"one of {', '.join(COLOR_SPACES)}")
+        try:
+            check_color_space(self.color_space)
+        except InputError as error:
+            raise InputError(f"color_space: {error}") from None
         self._check_data_window()
         self._check("estimator", self.estimator in ESTIMATOR_NAMES, f"one of {', '.join(ESTIMATOR_NAMES)}")
         self._check("absorption", self.absorption in (None, *ABSORPTION_NAMES), f"one of {', '.join(ABSORPTION_NAMES)}")

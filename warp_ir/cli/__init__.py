@@ -8,20 +8,22 @@ Heavy packages (Warp, USD, image libraries) are imported only when a command nee
 
 import atexit
 import importlib
+import logging
 import os
+import shlex
 import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
 from warp_ir.cli.arguments import parse
-from warp_ir.cli.console import say
+from warp_ir.cli.console import LOGGER, Messages, say
 from warp_ir.image.io import check_input
+from warp_ir.image.ocio import use_config
 from warp_ir.scene import InputError
 
 _LOADED = time.perf_counter()
@@ -54,47 +56,58 @@ def main(argv: Sequence[str] | None = None, started: float | None = None) -> int
     """
     started = time.perf_counter() if started is None else started
     argv = sys.argv[1:] if argv is None else list(argv)
-    verbose = "--verbose" in argv or "-v" in argv
     # A file name that the terminal cannot encode must not raise an error.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")
     in_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
+        with Messages() as messages:
+            return _run(argv, messages, started)
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGTERM, previous_handler)
+
+
+def _run(argv: Sequence[str], messages: Messages, started: float) -> int:
+    """Parses and executes the command line; returns the exit code."""
+    verbose = "--verbose" in argv or "-v" in argv
+    messages.configure(verbose=verbose)  # if the arguments are wrong
+    try:
         args = parse(argv)
+        messages.configure(quiet=args.quiet, verbose=args.verbose, file=args.log_file)
+        verbose = args.verbose
+        LOGGER.debug("%s", shlex.join(["warp-ir", *argv]))
         check_input(args.stage, "a USD file")  # before anything is imported that takes time
         args.started = started
-        code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
+        with use_config(args.ocio_config):
+            code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)
         sys.stdout.flush()
         return code
     except InputError as error:
-        return _fail(2, "error", error, verbose)
+        return _fail(2, f"error: {error}", trace=verbose)
     except KeyboardInterrupt:
-        say("interrupted")
+        say("interrupted", logging.ERROR)
         return 128 + signal.SIGINT
     except Terminated:
-        say("terminated")
+        say("terminated", logging.ERROR)
         return 128 + signal.SIGTERM
     except BrokenPipeError:
         # The program that reads our output has ended (`warp-ir info … | head`): report nothing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except MemoryError as error:
-        return _fail(1, "error", f"out of memory: {error or 'try a smaller --width'}", verbose)
+        return _fail(1, f"error: out of memory: {error or 'try a smaller --width'}")
     except Exception as error:
         hint = "" if verbose else " (--verbose shows where)"
-        return _fail(1, "internal error", f"{type(error).__name__}: {error}{hint}", verbose)
-    finally:
-        if in_main_thread:
-            signal.signal(signal.SIGTERM, previous_handler)
+        return _fail(1, f"internal error: {type(error).__name__}: {error}{hint}")
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-def _fail(code: int, kind: str, message: object, verbose: bool) -> int:
-    if verbose:
-        traceback.print_exc()
-    say(f"{kind}: {message}")
+def _fail(code: int, message: str, *, trace: bool = True) -> int:
+    """Reports the exception that is being handled; `trace` says whether its traceback may be of interest."""
+    LOGGER.error("%s", " ".join(message.split()), exc_info=trace)
     return code

@@ -9,11 +9,15 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from warp_ir import __version__
+from warp_ir.cli.toml_file import read_toml
+from warp_ir.image.cryptomatte import KINDS
+from warp_ir.image.exr import COMPRESSIONS
 from warp_ir.image.io import AOV_CHANNELS
+from warp_ir.image.ocio import use_config
 from warp_ir.image.tonemap import TONEMAPS
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
@@ -45,6 +49,18 @@ METHODS: Mapping[str, Mapping[str, str | bool]] = {
 """Methods of `warp-ir compare`: their names, and the settings that differ from the defaults."""
 _SET_BY_COMPARE = ("iterations", "time_limit", "target_error", "estimator", "filter", "denoise")
 """Settings that `warp-ir compare` chooses itself: it has no flags for them."""
+_TOGETHER: tuple[frozenset[str], ...] = (
+    frozenset({"iterations", "time_limit", "target_error"}),
+    frozenset({"width", "height", "res"}),
+    frozenset({"frames", "time", "default_time"}),
+    frozenset({"camera", "eye", "look_at"}),
+)
+"""Destinations of flags: one of them on the command line replaces all of a group in a settings file."""
+_NOT_IN_FILES = frozenset({"help", "settings"})
+_REPEATED = frozenset({"variants"})
+"""Destinations of flags that may be repeated."""
+_FILES = ("stage", "output", "ocio_config", "session_layer", "stats", "settings", "log_file")
+"""Destinations of arguments that are names of files."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 _RENDER_NOTES = """\
@@ -111,12 +127,110 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
+class _PrintCompletion(argparse.Action):
+    """Prints a shell's script for completion. shtab writes it from the parser: later starts cost nothing."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: object, shell: Any, __: str | None = None) -> None:
+        try:
+            import shtab
+        except ImportError as error:
+            raise InputError("--print-completion: needs shtab: pip install shtab") from error
+        if shell not in shtab.SUPPORTED_SHELLS:
+            raise InputError(f"--print-completion: must be one of {', '.join(shtab.SUPPORTED_SHELLS)}, is {shell!r}")
+        whole, commands = _parsers()
+        for action in (action for command in commands.values() for action in command._actions):
+            if action.dest in _FILES:
+                action.complete = shtab.FILE  # type: ignore[attr-defined]  # which shtab looks for
+        print(shtab.complete(whole, shell))
+        parser.exit()
+
+
 def parse(argv: Sequence[str]) -> argparse.Namespace:
     """Parses the arguments; `command` names the module of this package that executes the command.
 
+    Flags that a settings file gives count as if they stood on the command line, where that does not give them itself.
+
     Raises:
-        InputError: The arguments are wrong.
+        InputError: The arguments or the settings file are wrong.
     """
+    parser, commands = _parsers()
+    words = _join_aov_names(argv)
+    args, unknown = parser.parse_known_args(words)
+    if unknown:  # argparse itself would name the help of all commands
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
+    if not getattr(args, "settings", None):
+        return args
+    start = words.index(args.command) + 1
+    from_file = _words_of_file(args.settings, commands[args.command], words[start:])
+    return parser.parse_args([*words[:start], *from_file, *words[start:]])
+
+
+def _words_of_file(path: str, parser: argparse.ArgumentParser, given: Sequence[str]) -> list[str]:
+    """The words of a command line that stand for a settings file.
+
+    Args:
+        path: A TOML file whose keys are names of long flags, without the dashes.
+        parser: That of the command.
+        given: Words of the command line: what they give is left out.
+
+    Raises:
+        InputError: The file cannot be read, or a key or a value is wrong.
+    """
+    values = read_toml(path)
+    flags = {word: action for action in parser._actions for word in action.option_strings}
+    replaced = {flags[word].dest for word in _flags_in(given, flags)}
+    replaced |= {dest for together in _TOGETHER if replaced & together for dest in together}
+    words, kept = [], []
+    for key, value in values.items():
+        action = flags.get(f"--{key}")
+        if action is None or action.help == argparse.SUPPRESS or action.dest in _NOT_IN_FILES:
+            known = [w[2:] for w, a in flags.items() if w.startswith("--") and a.help != argparse.SUPPRESS]
+            import difflib
+
+            near = difflib.get_close_matches(key, sorted(set(known) - _NOT_IN_FILES), 1)
+            hint = f"; did you mean {near[0]!r}?" if near else f" (see {parser.prog} --help)"
+            raise InputError(f"{path}: {key!r} is no flag of {parser.prog}{hint}")
+        found = _words_of_value(path, key, value, action, flags)
+        words += found
+        kept += found if action.dest not in replaced else []
+    positional = ["-" for action in parser._actions if not action.option_strings]
+    try:  # here, so that the message names the file
+        parsed = parser.parse_args([*positional, *words])
+        with use_config(parsed.ocio_config):
+            settings_of(parsed)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return kept
+
+
+def _flags_in(words: Sequence[str], flags: Collection[str]) -> Iterator[str]:
+    """The flags among words, also from --flag=value and -fvalue."""
+    for word in words:
+        for flag in (word, word.partition("=")[0], word[:2]):
+            if flag in flags:
+                yield flag
+                break
+
+
+def _words_of_value(path: str, key: str, value: object, action: argparse.Action, flags: Collection[str]) -> list[str]:
+    """The words that give the value of a settings file to a flag."""
+    if action.nargs == 0:
+        if not isinstance(value, bool):
+            raise InputError(f"{path}: {key}: must be true or false, is {value!r}")
+        word = f"--{key}" if value else f"--no-{key}"
+        return [word] if word in flags else []
+    values = value if isinstance(value, list) else [value]
+    if any(isinstance(item, bool) or not isinstance(item, str | int | float) for item in values):
+        raise InputError(f"{path}: {key}: must be a number, a text or a list of these, is {value!r}")
+    texts = [str(item) for item in values]
+    if action.nargs is not None:
+        return [f"--{key}", *texts]
+    # Flags that collect values take one each, others a list with commas.
+    return [f"--{key}={text}" for text in (texts if action.dest in _REPEATED else [",".join(texts)])]
+
+
+def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """The parser of the command line, and those of the commands by name."""
     parser = _Parser(
         prog="warp-ir",
         description="Instant radiosity for USD scenes: diffuse global illumination on CPU and GPU.",
@@ -124,6 +238,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"warp-ir {__version__}")
+    completion = "print a script by which the shell completes commands and flags"
+    parser.add_argument("--print-completion", action=_PrintCompletion, metavar="SHELL", help=completion)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary, notes, fill in (
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
@@ -145,10 +261,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
         more = "print all warnings, and tracebacks of errors"
         messages.add_argument("--verbose", "-v", action="store_true", help=more)
-    args, unknown = parser.parse_known_args(_join_aov_names(argv))
-    if unknown:  # argparse itself would name the help of all commands
-        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
-    return args
+        log = "file to which all messages are appended, with their times, even with --quiet"
+        messages.add_argument("--log-file", metavar="FILE", help=log)
+        if name != "info":
+            preset = "TOML file of flags, such as light-paths = 512; those of the command line win"
+            command.add_argument("--settings", metavar="FILE.toml", help=preset)
+    return parser, commands.choices
 
 
 def _join_aov_names(argv: Sequence[str]) -> list[str]:
@@ -229,12 +347,29 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
-        default=TONEMAPS[0],
         help="tone curve of these files: srgb clips highlights, filmic compresses them smoothly (default: srgb)",
     )
+    display = (
+        "OpenColorIO display for which these files are made, in place of the tone curve (default: --tonemap, sRGB)"
+    )
+    output.add_argument("--ocio-display", metavar="NAME", help=display)
+    view = "OpenColorIO view of that display (default: the display's first)"
+    output.add_argument("--ocio-view", metavar="NAME", help=view)
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
     )
+    output.add_argument(
+        "--exr-compression",
+        choices=COMPRESSIONS,
+        default=COMPRESSIONS[0],
+        metavar="NAME",
+        help=f"of .exr: {', '.join(COMPRESSIONS)}; dwaa and dwab lose digits of colours (default: {COMPRESSIONS[0]})",
+    )
+    parts = "store the layers of .exr as one part, or as a part for each (default: one)"
+    output.add_argument("--exr-parts", choices=("one", "many"), default="one", help=parts)
+    mattes = f"Cryptomattes in .exr, by {' or '.join(KINDS)}: coverage counted by 64 more camera rays per pixel"
+    output.add_argument("--cryptomatte", type=_names(KINDS), default=[], metavar="NAME[,NAME]", help=mattes)
+    output.add_argument("--owner", metavar="TEXT", help="whose picture it is, written to .exr")
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)
@@ -386,6 +521,8 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         default="dome",
         help="light for a stage in which nothing emits (default: dome)",
     )
+    config = "OpenColorIO configuration, for textures and pictures: a file, or ocio://default (default: $OCIO)"
+    group.add_argument("--ocio-config", metavar="FILE", help=config)
     group.add_argument(
         "--metals",
         choices=("diffuse", "black"),

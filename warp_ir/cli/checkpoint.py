@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_ir import __version__
-from warp_ir.cli.console import say
+from warp_ir.cli.console import warn
 from warp_ir.image.io import whole_file
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
@@ -73,7 +73,7 @@ class Checkpoint:
             with whole_file(self.path) as temporary:
                 self._film.save(temporary, self._key())
         except InputError as error:
-            say(f"warning: no checkpoint: {error}")
+            warn(f"no checkpoint: {error}")
             self._failed = True
         now = time.monotonic()
         self._due = now + max(self._interval, (now - begin) / _MAX_TIME_SHARE)

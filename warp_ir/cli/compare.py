@@ -8,6 +8,7 @@ the reference: a pixel of the reference that is too dark by chance would otherwi
 
 import argparse
 import json
+import logging
 import math
 import signal
 import statistics
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp_ir as ir
 from warp_ir.cli.arguments import METHODS, settings_of
-from warp_ir.cli.console import ProgressDisplay, say, say_warnings
+from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, time_code_of
 from warp_ir.image.io import check_output, whole_file
@@ -102,8 +103,7 @@ def run(args: argparse.Namespace) -> int:
     device = open_device(args.device, verbose=args.verbose)
     reader = open_reader(args)
     scene = reader.read(time_code_of(args))
-    if not args.quiet:
-        say_warnings(scene.warnings, everything=args.verbose)
+    say_warnings(scene.warnings, everything=args.verbose)
     job = _Comparison(args, scene, device)
     runs: list[Run] = []
     code, reference = 0, None
@@ -118,18 +118,17 @@ def run(args: argparse.Namespace) -> int:
     except Terminated:
         code = 128 + signal.SIGTERM
     if reference is None or not runs:
-        say("interrupted before the first picture could be compared: there is no result")
+        say("interrupted before the first picture could be compared: there is no result", logging.ERROR)
         return code
     rows = _medians(runs)
     recommendation = recommend(rows, reference.resolution)
     _print_table(rows, reference)
     if code:
-        say("interrupted: the table holds what has been measured")
-    if not args.quiet:
-        _warn_of_floor(rows, reference)
-        if args.methods is None and len(methods) < len(METHODS):
-            say("vpl denoised is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
-    print(recommendation_text(recommendation, max(row.time_limit for row in rows)), flush=True)
+        say("interrupted: the table holds what has been measured", logging.ERROR)
+    _warn_of_floor(rows, reference)
+    if args.methods is None and len(methods) < len(METHODS):
+        say("vpl denoised is left out: Open Image Denoise is not installed: pip install 'warp-ir[denoise]'")
+    show_result(recommendation_text(recommendation, max(row.time_limit for row in rows)), quiet=False)
     title = f"{Path(args.stage).name}, {job.size[0]} x {job.size[1]}, on {device}"
     if picture is not None:
         with whole_file(picture) as temporary:
@@ -383,8 +382,8 @@ def _warn_of_floor(rows: Sequence[Run], reference: Reference) -> None:
     smallest = max(min(row.error for row in rows), reference.resolution)
     if reference.floor > smallest:
         seconds = math.ceil(reference.seconds * reference.floor / smallest)
-        say(
-            f"warning: the reference's own error exceeds the smallest measured error, which is therefore uncertain;"
+        warn(
+            f"the reference's own error exceeds the smallest measured error, which is therefore uncertain;"
             f" use --reference-time {seconds}"
         )
 

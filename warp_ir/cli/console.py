@@ -1,37 +1,135 @@
-"""Messages, warnings and progress of the command; all go to stderr."""
+"""Messages, warnings and progress of the command. They go through the logger "warp_ir", to stderr and to a log file."""
 
+import logging
 import math
 import os
 import sys
 import time
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from warp_ir.scene import InputError
+
 if TYPE_CHECKING:
+    from types import TracebackType
+
     from rich.progress import Progress as ProgressBar
     from rich.progress import TaskID
 
     from warp_ir.scheduling import Progress
 
+LOGGER = logging.getLogger("warp_ir")
 _WARNINGS_SHOWN = 10
 _FIRST_LINE_AFTER = 10.0
 """Seconds until the first line of progress where there is no bar; the wait doubles after each line."""
+_COMPILING_LINE_AFTER = 5.0
+"""Least seconds between two lines about the kernels that are being compiled."""
 
 
-def say(message: str) -> None:
-    """Prints the message on stderr as one line; line breaks in it become spaces."""
-    print("warp-ir:", " ".join(message.split()), file=sys.stderr, flush=True)
+class Messages:
+    """Sends what the logger "warp_ir" says to stderr, and on request to a file, while the context lasts."""
+
+    def __init__(self) -> None:
+        self._level = LOGGER.level
+        self._console = _Stderr()
+        self._handlers: list[logging.Handler] = []
+
+    def __enter__(self) -> "Messages":
+        """Begins to write to stderr."""
+        LOGGER.setLevel(logging.DEBUG)
+        self._add(self._console)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: "TracebackType | None"
+    ) -> None:
+        """Leaves the logger as it was."""
+        LOGGER.setLevel(self._level)
+        for handler in self._handlers:
+            LOGGER.removeHandler(handler)
+            handler.close()
+
+    def configure(self, *, quiet: bool = False, verbose: bool = False, file: str | None = None) -> None:
+        """Takes the flags of the command line.
+
+        Args:
+            quiet: Whether stderr shows errors alone.
+            verbose: Whether it shows tracebacks.
+            file: A file to which everything is appended, with time and level; None: none.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        self._console.setLevel(logging.ERROR if quiet else logging.INFO)
+        self._console.verbose = verbose
+        if file is None:
+            return
+        try:
+            log = logging.FileHandler(file, encoding="utf-8", errors="backslashreplace")
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"--log-file: {file!r} cannot be written: {reason}") from error
+        log.set_name("file")
+        log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        self._add(log)
+
+    def _add(self, handler: logging.Handler) -> None:
+        # A record may be for one of the handlers only.
+        handler.addFilter(lambda record: getattr(record, "only", handler.name) == handler.name)
+        LOGGER.addHandler(handler)
+        self._handlers.append(handler)
+
+
+class _Stderr(logging.Handler):
+    """Writes records to stderr, whatever that is at the time: one line each."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.set_name("console")
+        self.verbose = False
+        self._compiling_line = -math.inf  # when the last line about compiling was written
+
+    def emit(self, record: logging.LogRecord) -> None:
+        compiling: tuple[int, int] | None = getattr(record, "compiling", None)
+        if compiling is not None:
+            now = time.monotonic()
+            if compiling[0] > 0 and now - self._compiling_line < _COMPILING_LINE_AFTER:
+                return
+            self._compiling_line = now
+        if record.exc_info and self.verbose:
+            traceback.print_exception(*record.exc_info)
+        kind = "warning: " if record.levelno == logging.WARNING else ""
+        print(f"warp-ir: {kind}{record.getMessage()}", file=sys.stderr, flush=True)
+
+
+def say(message: str, level: int = logging.INFO) -> None:
+    """Says something in one line; line breaks in it become spaces. --quiet hides what is below `logging.ERROR`."""
+    LOGGER.log(level, "%s", " ".join(message.split()))
+
+
+def warn(message: str) -> None:
+    """Says a warning in one line."""
+    say(message, logging.WARNING)
+
+
+def show_result(message: str, *, quiet: bool) -> None:
+    """Prints a result on stdout, unless `quiet` is set, and logs it."""
+    if not quiet:
+        print(message, flush=True)
+    LOGGER.info("%s", message, extra={"only": "file"})
 
 
 def say_warnings(warnings: Iterable[str], *, everything: bool = False) -> None:
-    """Prints the scene's warnings: the first ten and the number of the others, or all if `everything` is set."""
+    """Says the scene's warnings: on stderr the first ten and the number of the others, or all with `everything`."""
     warnings = list(dict.fromkeys(warnings))
-    shown = warnings if everything or len(warnings) == _WARNINGS_SHOWN + 1 else warnings[:_WARNINGS_SHOWN]
-    for warning in shown:
-        say(f"warning: {warning}")
-    if len(warnings) > len(shown):
-        say(f"warning: ... and {len(warnings) - len(shown)} more; --verbose shows all")
+    shown = len(warnings) if everything or len(warnings) == _WARNINGS_SHOWN + 1 else _WARNINGS_SHOWN
+    for number, warning in enumerate(warnings):
+        LOGGER.warning("%s", " ".join(warning.split()), extra={} if number < shown else {"only": "file"})
+    if len(warnings) > shown:
+        more = f"... and {len(warnings) - shown} more; --verbose shows all"
+        LOGGER.warning("%s", more, extra={"only": "console"})
 
 
 @contextmanager
@@ -81,10 +179,12 @@ class ProgressDisplay:
             self._bar = ProgressBar(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
             self._task = self._bar.add_task(self._label, total=None, status="preparing")
+            LOGGER.addFilter(self._show_compiling)
         return self
 
     def __exit__(self, *_: object) -> None:
         """Removes the bar."""
+        LOGGER.removeFilter(self._show_compiling)
         if self._bar is not None:
             self._bar.stop()
 
@@ -98,6 +198,15 @@ class ProgressDisplay:
         elif time.monotonic() - self._last_line >= self._wait:
             self._wait, self._last_line = 2.0 * self._wait, time.monotonic()
             say(f"{self._label}: {100.0 * progress.fraction:.0f} %, {status}")
+
+    def _show_compiling(self, record: logging.LogRecord) -> bool:
+        """A filter of the logger: what is said of compiling after the first line is shown by the bar."""
+        compiling: tuple[int, int] | None = getattr(record, "compiling", None)
+        if compiling is not None and self._bar is not None and self._task is not None:
+            self._bar.update(self._task, status=f"compiling kernels, {compiling[0]} of {compiling[1]}")
+            if compiling[0] > 0:
+                record.only = "file"
+        return True
 
 
 def describe_progress(progress: "Progress") -> str:

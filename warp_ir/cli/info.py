@@ -46,8 +46,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({**facts, "warnings": list(scene.warnings)}, indent=2))
         return 0
     _print_table(facts, math.inf if args.verbose else _MAX_LINES)
-    if not args.quiet:
-        say_warnings(scene.warnings, everything=args.verbose)
+    say_warnings(scene.warnings, everything=args.verbose)
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 import math
 import os
 import platform
@@ -16,13 +17,15 @@ from typing import TYPE_CHECKING, Any
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint
-from warp_ir.cli.console import ProgressDisplay, say, say_warnings
+from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
-from warp_ir.cli.stage_options import open_reader, time_code_of
-from warp_ir.image.io import SUFFIXES, check_output, whole_file, write_image
-from warp_ir.image.tonemap import suggest_exposure
+from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
+from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
+from warp_ir.image.io import DISPLAYED, SUFFIXES, check_output, whole_file, write_image
+from warp_ir.image.ocio import check_view
+from warp_ir.image.tonemap import TONEMAPS, suggest_exposure
 from warp_ir.scene import InputError, Scene
 
 if TYPE_CHECKING:
@@ -59,6 +62,8 @@ class _Job:
     device: str
     versions: Mapping[str, str]
     reader: "StageReader"
+    view: tuple[str, str] | None
+    """OpenColorIO's display and view; None: pictures are tone-mapped."""
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
     write_seconds: float | None = None
@@ -73,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
     settings_of(args)
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
+    _check_exr_flags(args, into_folder)
+    view = _view(args, into_folder)
     if not into_folder:
         outputs = outputs_of(args.output, args.frames, time_code_of(args))
         pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
@@ -88,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader)
+    job = _Job(args, device, versions, reader, view)
     if into_folder:
         pictures = _products(job)
 
@@ -113,6 +120,38 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
+def _check_exr_flags(args: argparse.Namespace, into_folder: bool) -> None:
+    """Raises `InputError` if flags for .exr are given for another file, or contradict each other."""
+    if args.cryptomatte and args.exr_compression in LOSSY and args.exr_parts == "one":
+        raise InputError(f"--exr-compression: {args.exr_compression} would change Cryptomattes; add --exr-parts many")
+    if into_folder or Path(args.output).suffix.lower() == ".exr":
+        return
+    given = {
+        "--exr-compression": args.exr_compression != COMPRESSIONS[0],
+        "--exr-parts": args.exr_parts != "one",
+        "--cryptomatte": bool(args.cryptomatte),
+        "--owner": args.owner is not None,
+    }
+    for flag in (flag for flag, is_given in given.items() if is_given):
+        raise InputError(f"{flag}: has no effect on {args.output}; name an .exr file")
+
+
+def _view(args: argparse.Namespace, into_folder: bool) -> tuple[str, str] | None:
+    """OpenColorIO's display and view that the flags choose; None: they do not.
+
+    Raises:
+        InputError: They do not exist, or have no effect.
+    """
+    if args.ocio_display is None and args.ocio_view is None:
+        return None
+    flag = "--ocio-view" if args.ocio_display is None else "--ocio-display"
+    if args.tonemap is not None:
+        raise InputError(f"{flag}: takes the place of --tonemap; give one of them")
+    if not into_folder and Path(args.output).suffix.lower() not in DISPLAYED:
+        raise InputError(f"{flag}: has no effect on {args.output}; name a file of type {', '.join(DISPLAYED)}")
+    return check_view(args.ocio_display, args.ocio_view)
+
+
 def _products(job: _Job) -> list[_Picture]:
     """The pictures that the stage's RenderProducts ask for, in the user's folder.
 
@@ -133,7 +172,7 @@ def _products(job: _Job) -> list[_Picture]:
                 )
             name = Path(product.name)
             if name.suffix.lower() not in SUFFIXES:
-                say(f"warning: {product.path}: files of type {name.suffix!r} cannot be written; .exr is used")
+                warn(f"{product.path}: files of type {name.suffix!r} cannot be written; .exr is used")
                 name = name.with_suffix(".exr")
             if args.frames and "#" not in str(name) and folder / name in taken:
                 name = name.with_name(f"{name.stem}.####{name.suffix}")
@@ -167,9 +206,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
             for name in ("meshes", "lights")
         }
         job.previous_scene = scene
-        if not args.quiet:
-            say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
-            job.warned.update(scene.warnings)
+        say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
+        job.warned.update(scene.warnings)
         settings = settings_of(args, scene.settings)
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
@@ -186,6 +224,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 checkpoint.write_if_due()
 
         begin = time.perf_counter()
+        exr = _exr_options(job, picture)  # before the render, so that its camera rays are within the time limit
         reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
         renderer.render(film, report, started=started, reserve=reserve)
         render_seconds = time.perf_counter() - begin
@@ -213,9 +252,11 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                     film,
                     aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
                     exposure=args.exposure,
-                    tonemap=args.tonemap,
+                    tonemap=args.tonemap or TONEMAPS[0],
+                    view=job.view,
                     half=args.half,
                     metadata=metadata,
+                    exr=exr,
                 )
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
@@ -231,8 +272,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     if settings.time_limit is not None and film.iterations == 1 and film.seconds > settings.time_limit:
         late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
         picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
-    if not args.quiet:
-        say_warnings(picture_warnings)
+    say_warnings(picture_warnings)
     _summarize(job, path, film, written=bool(written), blank=bool(blank))
     statistics = {
         "output": [str(file) for file in written],
@@ -253,6 +293,20 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         "warnings": [*scene.warnings, *picture_warnings],
     }
     return statistics, code
+
+
+def _exr_options(job: _Job, picture: _Picture) -> ExrOptions:
+    """How the picture's EXR files are stored; traces the Cryptomattes if there is such a file."""
+    args = job.args
+    wanted = args.cryptomatte if any(file.suffix.lower() == ".exr" for file in picture.files) else []
+    assert job.renderer is not None
+    return ExrOptions(
+        compression=args.exr_compression,
+        multipart=args.exr_parts == "many",
+        cryptomattes=[matte for matte in job.renderer.cryptomattes() if matte.kind in wanted] if wanted else [],
+        owner=args.owner,
+        frames_per_second=frames_per_second(job.reader),
+    )
 
 
 def _blank_picture(scene: Scene, film: "Film") -> str:
@@ -294,19 +348,17 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     A blank picture says nothing about the light that its samples have missed: it has no estimated error.
     """
     if film.interrupted:
-        say("interrupted" if written else "interrupted before the first iteration: nothing written")
-    if not written or job.args.quiet:
+        message = "interrupted" if written else "interrupted before the first iteration: nothing written"
+        say(message, logging.ERROR)
+    if not written:
         return
     error = film.error()
     estimate = f", estimated error {100.0 * error:.2g} %" if math.isfinite(error) and not blank else ""
-    print(
-        f"{path}: {film.width} x {film.height}, {film.iterations} iterations in {film.seconds:.2f} s"
-        f" on {job.device}{estimate}",
-        flush=True,
-    )
+    summary = f"{path}: {film.width} x {film.height}, {film.iterations} iterations in {film.seconds:.2f} s"
+    show_result(f"{summary} on {job.device}{estimate}", quiet=job.args.quiet)
     if film.rejected:
-        say(f"warning: {film.rejected} non-finite samples were replaced")
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+        warn(f"{film.rejected} non-finite samples were replaced")
+    if path.suffix.lower() in DISPLAYED:
         stops = suggest_exposure(film.radiance(), job.args.exposure)
         if stops is not None:
             brightness = "dark" if stops > job.args.exposure else "bright"

@@ -46,6 +46,18 @@ def time_code_of(args: argparse.Namespace) -> TimeCode:
     return "default" if args.default_time else args.time
 
 
+def frames_per_second(reader: "StageReader") -> float | None:
+    """The rate at which the stage's frames are played: its framesPerSecond, or else its timeCodesPerSecond.
+
+    None: it authors neither, or what no rate can be.
+    """
+    for name in ("framesPerSecond", "timeCodesPerSecond"):
+        if reader.stage.HasAuthoredMetadata(name):
+            rate = reader.stage.GetMetadata(name)
+            return float(rate) if isinstance(rate, int | float) and 0.0 < rate < 1.0e6 else None
+    return None
+
+
 def stage_facts(reader: "StageReader", time: TimeCode = None) -> dict[str, Any]:
     """Up axis, unit, frames, cameras and render settings of a stage, as plain values for JSON.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import warp_ir as ir
 from warp_ir.cli.arguments import VPL_DRAWING, settings_of
-from warp_ir.cli.console import muted_stderr, say, say_warnings
+from warp_ir.cli.console import muted_stderr, say, say_warnings, show_result
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, stage_facts, time_code_of
 from warp_ir.image.io import check_output, whole_file
@@ -34,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     device = open_device(args.device, verbose=args.verbose)
     reader = open_reader(args)
     scene = reader.read(time_code_of(args))
-    if not args.quiet:
-        say_warnings(scene.warnings, everything=args.verbose)
+    say_warnings(scene.warnings, everything=args.verbose)
     vpls = ir.trace_vpls(scene, settings, device=device, iteration=args.iteration, contribution_to=args.contribution_to)
     if suffix == ".npz":
         _write_arrays(path, vpls)
@@ -48,12 +47,11 @@ def run(args: argparse.Namespace) -> int:
     else:
         with muted_stderr(not args.verbose):
             _draw(args, path, scene, vpls, settings)
-    if not args.quiet:
-        directional = int(np.count_nonzero(vpls.directional))
-        addition = f", {directional} of them directional" if directional else ""
-        print(f"{path}: {len(vpls.positions)} VPLs{addition}")
-        if directional and suffix == ".usda" and not args.as_lights:
-            say(f"{directional} directional VPLs (sun and sky) have no position and are left out")
+    directional = int(np.count_nonzero(vpls.directional))
+    addition = f", {directional} of them directional" if directional else ""
+    show_result(f"{path}: {len(vpls.positions)} VPLs{addition}", quiet=args.quiet)
+    if directional and suffix == ".usda" and not args.as_lights:
+        say(f"{directional} directional VPLs (sun and sky) have no position and are left out")
     return 0
 
 

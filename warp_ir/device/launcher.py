@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 import warp as wp
 
+from warp_ir.device.compiling import ModuleLoader
 from warp_ir.device.profiling import Profile
 from warp_ir.scene import InputError
 
@@ -89,6 +90,7 @@ class Launcher:
         self.exclusive = threading.RLock()
         """Held by whoever launches kernels, or works on buffers that iterations and pictures share."""
         self._lock = threading.Lock()
+        self._modules = ModuleLoader(self.device, _BLOCK_DIM)
         self._loader: ThreadPoolExecutor | None = None
         self._loading: dict[Any, Future[Any]] = {}  # by Warp's module
         self._open: list[_Launch] = []  # launches with bands left; the latest is the most urgent
@@ -109,11 +111,15 @@ class Launcher:
             with self.loading():
                 self.load(modules)
             return
-        for m in modules:
-            load = self._loader.submit(wp.load_module, m, device=self.device, block_dim=_BLOCK_DIM)
-            self._loading[wp.get_module(m.__name__)] = load
+        self.expect(modules)
+        for module in _warp_modules(modules):
+            self._loading[module] = self._loader.submit(self._modules.load, module)
         if self.device.is_cuda:  # uploading does not overlap with compiling there
             self._wait_for(*self._loading)
+
+    def expect(self, modules: Sequence[Any]) -> None:
+        """Announces Python modules for which `load` will be called, so that progress counts them from the start."""
+        self._modules.expect(_warp_modules(modules))
 
     @contextmanager
     def loading(self) -> Iterator[None]:
@@ -149,6 +155,7 @@ class Launcher:
         if count <= 0:
             return
         self._wait_for(kernel.module)
+        self._modules.load(kernel.module)
         if self.device.is_cuda:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
@@ -345,6 +352,11 @@ def copy_record(record: Record) -> Record:
 def float_count(*dtypes: Any) -> int:
     """Number of float32 in a row of these types."""
     return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes) // 4
+
+
+def _warp_modules(modules: Sequence[Any]) -> list[Any]:
+    """Warp's modules of some Python modules."""
+    return [wp.get_module(module.__name__) for module in modules]
 
 
 def _usable_cores() -> int:

@@ -105,6 +105,18 @@ def _add_iteration(
         film.depth[i] += gbuffer.depth[i]
 
 
+@wp.kernel
+def _write_radiance(first: int, film: FilmData, out: wp.array[wp.vec3]) -> None:
+    """Writes the mean radiance of every pixel."""
+    i = first + wp.tid()
+    out[i] = emission_of(film, i) + film.direct[i] + film.indirect[i]
+
+
+def write_radiance(film: FilmData, out: "wp.array[wp.vec3]", launcher: Launcher) -> None:
+    """Writes the mean radiance to an array on the device with a row per pixel."""
+    launcher.launch(_write_radiance, out.shape[0], [film, out])
+
+
 def new_film_data(pixels: int, has_emission: bool, sees_lights: bool, launcher: Launcher) -> FilmData:
     """An empty `FilmData`; the flags say whether the camera may see emission, and lights that are no surfaces."""
     data = FilmData()

@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceFrame
-from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, new_film_data
+from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, new_film_data, write_radiance
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
 from warp_ir.film.picture_noise import PictureNoise, tile_sums
@@ -38,6 +38,7 @@ _CLEAN_ITERATIONS = 8
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_Out = TypeVar("_Out")
 
 
 def _exclusive(method: "Callable[Concatenate[Film, _P], _R]") -> "Callable[Concatenate[Film, _P], _R]":
@@ -194,12 +195,100 @@ class Film:
         self.choose(self.chosen)
         self.seconds += other.seconds
 
-    @_exclusive
-    def radiance(self) -> npt.NDArray[np.float32]:
+    @overload
+    def radiance(self) -> npt.NDArray[np.float32]: ...
+    @overload
+    def radiance(self, out: _Out) -> _Out: ...
+    def radiance(self, out: Any = None) -> Any:
         """Radiance [W sr⁻¹ m⁻²], float32 [height, width, 3], linear Rec. 709, row 0 at the top.
 
         The mean of the iterations, filtered or denoised if the settings say so.
+
+        Args:
+            out: Where to write it: a C-contiguous float32 array [height, width, 3] on the film's device, of NumPy, Warp
+                or any package that speaks DLPack, such as PyTorch. It has been written when the call returns. The mean
+                is written there by a kernel, without a copy; a filtered or denoised picture lies on the host, and is
+                copied. None: a new NumPy array.
+
+        Returns:
+            `out`, or the new array.
+
+        Raises:
+            InputError: `out` is no such array.
         """
+        if out is None:
+            return self._radiance()
+        self._write_radiance(self._writable(out))
+        return out
+
+    @_exclusive
+    def _write_radiance(self, array: "wp.array[Any]") -> None:
+        """Writes the radiance to an array that `_writable` has checked."""
+        if self.iterations > 0 and (self.reconstruction is not None or (self.settings and self.settings.denoise)):
+            array.assign(self._radiance())
+        else:
+            # A launch could be cancelled by a signal that ends a render.
+            with self._launcher.uninterruptible():
+                write_radiance(self._data, array.view(wp.vec3).reshape(self.width * self.height), self._launcher)
+        wp.synchronize_device(self._launcher.device)
+
+    def to_warp(self) -> "wp.array[wp.float32]":
+        """The radiance as a new Warp array, float32 [height, width, 3], on the film's device.
+
+        It is what `radiance` writes: later iterations do not change it.
+        """
+        return self.radiance(out=self._launcher.empty((self.height, self.width, 3), wp.float32))
+
+    def __dlpack__(
+        self,
+        *,
+        stream: int | None = None,
+        max_version: tuple[int, int] | None = None,  # Warp's capsules are of version 0, which everyone takes
+        dl_device: tuple[int, int] | None = None,
+        copy: bool | None = None,
+    ) -> Any:
+        """The array of `to_warp` by DLPack, as `numpy.from_dlpack(film)` and `torch.from_dlpack(film)` ask for it.
+
+        The picture is made for the call, and handed over without a further copy.
+
+        Raises:
+            BufferError: Another device is asked for, or memory that is not the caller's own.
+        """
+        if dl_device not in (None, self.__dlpack_device__()):
+            raise BufferError(f"the film is on {self._launcher.device}")
+        if copy is False:
+            raise BufferError("the picture of a film is made anew by each call")
+        return self.to_warp().__dlpack__(stream)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        """Type and number of the film's device, in DLPack's terms."""
+        kind, number = self._launcher.empty(1, wp.float32).__dlpack_device__()
+        return int(kind), int(number)
+
+    def _writable(self, out: Any) -> "wp.array[Any]":
+        """`out` as a Warp array on the same memory.
+
+        Raises:
+            InputError: It is no array that the radiance can be written to.
+        """
+        wanted = f"a C-contiguous float32 array [{self.height}, {self.width}, 3] on {self._launcher.device}"
+        array: wp.array[Any] | None = None
+        try:
+            if isinstance(out, np.ndarray):
+                good = out.dtype == np.float32 and out.flags.c_contiguous and out.flags.writeable
+                array = wp.array(out, dtype=wp.float32, copy=False, device="cpu") if good else None
+            else:
+                array = out if isinstance(out, wp.array) else wp.from_dlpack(out)  # type: ignore[assignment]  # stubs
+        except (TypeError, ValueError, RuntimeError, AttributeError, BufferError) as error:
+            raise InputError(f"out: must be {wanted}: {error}") from error
+        good = array is not None and array.dtype is wp.float32 and array.shape == (self.height, self.width, 3)
+        if array is None or not (good and array.is_contiguous and array.device == self._launcher.device):
+            raise InputError(f"out: must be {wanted}")
+        return array
+
+    @_exclusive
+    def _radiance(self) -> Image:
+        """The radiance on the host."""
         pictures: list[Image] = []
         if self.reconstruction is not None and self.iterations > 0:
             direct, indirect = self._reconstruct(self.reconstruction)[:2]

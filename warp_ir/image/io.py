@@ -3,20 +3,24 @@
 `.exr`, `.hdr`, `.pfm` and `.npy` hold linear radiance, `.png`, `.jpg` and `.tif` tone-mapped display values.
 """
 
+import json
 import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.image.color_space import COLOR_SPACES, REC709, from_rec709
+from warp_ir.image.color_space import COLOR_SPACES, REC709
+from warp_ir.image.exr import ExrOptions, camera_matrices
+from warp_ir.image.ocio import active_config, check_color_space, display_values, to_color_space
 from warp_ir.image.tonemap import srgb_from_linear, tone_map
-from warp_ir.scene import InputError
+from warp_ir.scene import InputError, Scene
 
 if TYPE_CHECKING:
     import OpenImageIO as oiio
@@ -35,18 +39,39 @@ AOV_CHANNELS = {
 }
 """Channels of an EXR file that hold the AOVs of a film; its radiance is in R, G and B."""
 
-SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DISPLAYED = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Extensions of pictures for a display: they are tone-mapped, or made by an OpenColorIO view."""
+SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", *DISPLAYED)
 """Extensions of the pictures that can be written."""
 
 _HALF_MAX = 65504.0
 _FULL_FLOAT_AOVS = frozenset({"position", "depth", "prim_id"})
 """AOVs that a half-float file stores with 32 bits: 11 bits of precision are too few for distances and indices."""
-_COLORS = frozenset({None, "direct", "indirect", "albedo"})
-"""AOVs that are colours; None stands for the radiance."""
+_LIGHT = frozenset({None, "direct", "indirect"})
+"""AOVs that are radiance; None stands for the whole."""
+_COLORS = _LIGHT | {"albedo"}
+"""AOVs that are colours."""
 
 
-_Channels = dict[str, tuple[Array, bool]]
-"""Channels of an EXR file: name -> values, float32 [h, w], and whether they need 32 bits."""
+_EXR = ExrOptions()
+
+
+class _Shown(NamedTuple):
+    """How linear radiance becomes display values; the arguments of `write_image`."""
+
+    exposure: float
+    tonemap: str
+    view: tuple[str, str] | None
+
+
+class _Layer(NamedTuple):
+    """A picture, an AOV or a Cryptomatte in an EXR file."""
+
+    name: str
+    channels: dict[str, tuple[Array, bool]]
+    """Name -> values, float32 [h, w], and whether they need 32 bits."""
+    is_color: bool
+    """Whether a compression may lose digits."""
 
 
 class _Settings(Protocol):
@@ -54,6 +79,10 @@ class _Settings(Protocol):
 
     @property
     def color_space(self) -> str: ...
+    @property
+    def conform(self) -> str: ...
+    @property
+    def pixel_aspect(self) -> float: ...
     @property
     def width(self) -> int: ...
     @property
@@ -67,6 +96,8 @@ class _Film(Protocol):
 
     @property
     def settings(self) -> _Settings | None: ...
+    @property
+    def origin(self) -> object: ...
     @property
     def iterations(self) -> int: ...
     @property
@@ -82,11 +113,13 @@ def write_image(
     *,
     exposure: float = 0.0,
     tonemap: str = "srgb",
+    view: tuple[str, str] | None = None,
     aov: str | None = None,
     aovs: Sequence[str] = (),
     half: bool = True,
     metadata: Mapping[str, object] | None = None,
     color_space: str | None = None,
+    exr: ExrOptions = _EXR,
 ) -> list[Path]:
     """Writes a picture in the format of the file's extension.
 
@@ -97,14 +130,17 @@ def write_image(
             linear Rec. 709, row 0 at the top.
         exposure: Exposure [stops]; for `.png`, `.jpg` and `.tif` only.
         tonemap: "srgb" or "filmic"; for `.png`, `.jpg` and `.tif` only.
+        view: A display and its view in the OpenColorIO configuration that $OCIO names, in place of the tone curve.
         aov: Name of the film's AOV to write in place of its radiance.
         aovs: Names of further AOVs of the film. An EXR file holds them as layers; for other formats, each is written
             to a file of its own: picture.NAME.png for picture.png.
         half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped,
             with a warning that counts their pixels.
         metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
-        color_space: One of `COLOR_SPACES`, for colours in the linear formats; None: that of the film's settings, or
-            linear Rec. 709 for an array.
+        color_space: One of `COLOR_SPACES`, or a linear one of that configuration, for colours in the linear formats;
+            None: that of the film's settings, or linear Rec. 709 for an array.
+        exr: How an EXR file is stored, and its Cryptomattes. Those of a film that a `Renderer` made have the camera's
+            matrices; with the AOV prim_id, the attribute `warp_ir:prim_names` lists the names by their numbers.
 
     Returns:
         The paths of the written files.
@@ -116,20 +152,24 @@ def write_image(
     if color_space is None:
         settings = None if isinstance(source, np.ndarray) else source.settings
         color_space = REC709 if settings is None else settings.color_space
-    if color_space not in COLOR_SPACES:
-        raise InputError(f"{path}: no colour space {color_space!r}; known are {', '.join(COLOR_SPACES)}")
+    try:
+        check_color_space(color_space)
+    except InputError as error:
+        raise InputError(f"{path}: color_space: {error}") from None
     suffix = path.suffix.lower()
     if isinstance(source, np.ndarray) and (aov or aovs):
         raise InputError(f"{path}: an array has no AOVs; write a film")
     if suffix == ".exr":
-        channels = _exr_channels(source, aov, aovs, color_space)
-        attributes = {**_attributes(source, metadata or {}), "colorInteropID": color_space}
-        _write_exr(path, channels, half, attributes, COLOR_SPACES[color_space], _data_window(source))
+        layers = _exr_layers(source, aov, aovs, color_space, exr)
+        attributes = {**_attributes(source, metadata or {}), **exr.attributes(), **_view_attributes(source, aovs)}
+        attributes |= _color_attributes(color_space)
+        _write_exr(path, layers, half, attributes, exr, _data_window(source))
         return [path]
-    _write_single_layer(path, source, exposure, tonemap, aov, color_space)
+    shown = _Shown(exposure, tonemap, view)
+    _write_single_layer(path, source, shown, aov, color_space)
     aov_paths = [aov_path(path, name) for name in aovs]
     for name, other in zip(aovs, aov_paths, strict=True):
-        _write_single_layer(other, source, exposure, tonemap, name, color_space)
+        _write_single_layer(other, source, shown, name, color_space)
     return [path, *aov_paths]
 
 
@@ -138,7 +178,8 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
 
     Args:
         path: A file of any of `SUFFIXES`, or of another format that OpenImageIO reads.
-        layer: Name of an AOV in an EXR file; None: the colour, with alpha if there is one.
+        layer: Name of an AOV in an EXR file, or of four channels R, G, B, A such as "crypto_object00", in whichever
+            part it is; None: the colour, with alpha if there is one.
 
     Raises:
         InputError: The file cannot be read, or lacks the layer.
@@ -158,21 +199,28 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
+    wanted = ("R", "G", "B") if layer is None else AOV_CHANNELS.get(layer, [f"{layer}.{c}" for c in "RGBA"])
     try:
-        pixels = reader.read_image(oiio.FLOAT) if reader else None
-        if reader is None or pixels is None:
+        if reader is None:
+            raise InputError(f"{path}: {oiio_error()}")
+        parts = [list(reader.spec().channelnames)]
+        while path.suffix.lower() == ".exr" and reader.seek_subimage(len(parts), 0):
+            parts.append(list(reader.spec().channelnames))
+        oiio_error(reader)  # clears the error of seeking past the last part
+        part = next((number for number, names in enumerate(parts) if set(wanted) <= set(names)), None)
+        if layer is not None and part is None:
+            channels = ", ".join(name for names in parts for name in names)
+            raise InputError(f"{path}: has no layer {layer!r}; its channels are {channels}")
+        names = parts[part or 0]
+        pixels = reader.read_image(part or 0, 0, 0, len(names), oiio.FLOAT)
+        if pixels is None:
             raise InputError(f"{path}: {oiio_error(reader)}")
-        names = list(reader.spec().channelnames)
         reader.close()
     except UnicodeDecodeError as error:  # names in a damaged file
         raise InputError(f"{path}: {first_line(str(error))}") from None
     pixels = np.asarray(pixels, dtype=np.float32).reshape(*pixels.shape[:2], -1)
     if layer is None:
         wanted = [name for name in ("R", "G", "B", "A") if name in names] or names
-    else:
-        wanted = list(AOV_CHANNELS.get(layer, ()))
-        if not wanted or not set(wanted) <= set(names):
-            raise InputError(f"{path}: has no layer {layer!r}; its channels are {', '.join(names)}")
     return np.ascontiguousarray(pixels[..., [names.index(name) for name in wanted]])
 
 
@@ -287,11 +335,13 @@ def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | No
 
 def _linear(values: Array, aov: str | None, color_space: str) -> Array:
     """Values as linear formats store them: colours in the given colour space, others unchanged."""
-    return from_rec709(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
+    return to_color_space(values, color_space) if aov in _COLORS and values.shape[2] == 3 else values
 
 
-def _exr_channels(source: "_Film | Array", aov: str | None, aovs: Sequence[str], color_space: str) -> _Channels:
-    """Channels of an EXR file with the picture, alpha and AOVs."""
+def _exr_layers(
+    source: "_Film | Array", aov: str | None, aovs: Sequence[str], color_space: str, exr: ExrOptions
+) -> list[_Layer]:
+    """Layers of an EXR file: the picture with alpha, AOVs, and Cryptomattes."""
     values, alpha = _pixels(source, aov)
     values = _linear(values, aov, color_space)
     names: Sequence[str] = ("R", "G", "B")
@@ -300,11 +350,40 @@ def _exr_channels(source: "_Film | Array", aov: str | None, aovs: Sequence[str],
     channels = {name: (values[..., k], aov in _FULL_FLOAT_AOVS) for k, name in enumerate(names)}
     if alpha is not None:
         channels["A"] = (alpha[..., 0], False)
+    layers = [_Layer(aov or "rgba", channels, aov in _COLORS)]
     for name in aovs:
         values = _linear(_pixels(source, name)[0], name, color_space)
         full_float = name in _FULL_FLOAT_AOVS
-        channels |= {channel: (values[..., k], full_float) for k, channel in enumerate(AOV_CHANNELS[name])}
-    return channels
+        channels = {channel: (values[..., k], full_float) for k, channel in enumerate(AOV_CHANNELS[name])}
+        layers.append(_Layer(name, channels, name in _COLORS))
+    for matte in exr.cryptomattes:
+        channels = {name: (plane, True) for name, plane in matte.channels().items()}
+        layers.append(_Layer(f"crypto_{matte.kind}", channels, False))
+    return layers
+
+
+def _color_attributes(color_space: str) -> dict[str, Any]:
+    """What an EXR file says of its colour space."""
+    if color_space in COLOR_SPACES:
+        return {"colorInteropID": color_space, "chromaticities": COLOR_SPACES[color_space]}
+    config = active_config()
+    name = config.interop_id(color_space) if config is not None else ""
+    return {"colorInteropID": name} if name else {}
+
+
+def _view_attributes(source: "_Film | Array", aovs: Sequence[str]) -> dict[str, Any]:
+    """Matrices of the camera and names of meshes, if the source is a film of a known scene."""
+    scene = None if isinstance(source, np.ndarray) else source.origin
+    settings = None if isinstance(source, np.ndarray) else source.settings
+    out: dict[str, Any] = {}
+    if not isinstance(scene, Scene):
+        return out
+    if settings is not None and settings.height is not None:
+        fitted = scene.camera.fit(settings.width, settings.height, settings.conform, settings.pixel_aspect)
+        out |= camera_matrices(fitted)
+    if "prim_id" in aovs:
+        out["warp_ir:prim_names"] = json.dumps([mesh.name for mesh in scene.meshes])
+    return out
 
 
 def _data_window(source: "_Film | Array") -> tuple[int, int, int, int] | None:
@@ -318,44 +397,65 @@ def _data_window(source: "_Film | Array") -> tuple[int, int, int, int] | None:
 
 def _write_exr(
     path: Path,
-    channels: _Channels,
+    layers: Sequence[_Layer],
     half: bool,
-    attributes: Mapping[str, str | float],
-    chromaticities: Sequence[float],
+    attributes: Mapping[str, Any],
+    exr: ExrOptions,
     window: tuple[int, int, int, int] | None,
 ) -> None:
     """Writes an EXR file; `window` is a `_data_window`."""
+    if not exr.multipart:
+        together = {name: plane for layer in layers for name, plane in layer.channels.items()}
+        layers = [_Layer("", together, True)]
+    _warn_of_clipping(path, layers, half)
+    parts = [_exr_part(layer, half, attributes, exr, window) for layer in layers]
+    _save(path, [spec for spec, _ in parts], [pixels for _, pixels in parts])
+
+
+def _warn_of_clipping(path: Path, layers: Sequence[_Layer], half: bool) -> None:
+    """Warns of values that 16 bits cannot hold."""
+    planes = [plane for layer in layers for plane, full_float in layer.channels.values() if half and not full_float]
+    clipped = int(np.any([np.abs(plane) > _HALF_MAX for plane in planes], axis=0).sum()) if planes else 0
+    if clipped:
+        what = f"{clipped} of {planes[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
+        warnings.warn(f"{path}: {what}; 32 bits hold them (half=False, --float)", stacklevel=4)
+
+
+def _exr_part(
+    layer: _Layer,
+    half: bool,
+    attributes: Mapping[str, Any],
+    exr: ExrOptions,
+    window: tuple[int, int, int, int] | None,
+) -> tuple["oiio.ImageSpec", Array]:
+    """The header and the pixels of a part of an EXR file."""
     import OpenImageIO as oiio
 
-    formats = [oiio.HALF if half and not full_float else oiio.FLOAT for _, full_float in channels.values()]
+    formats = [oiio.HALF if half and not full_float else oiio.FLOAT for _, full_float in layer.channels.values()]
     planes = [
         np.clip(plane, -_HALF_MAX, _HALF_MAX) if stored == oiio.HALF else plane
-        for (plane, _), stored in zip(channels.values(), formats, strict=True)
+        for (plane, _), stored in zip(layer.channels.values(), formats, strict=True)
     ]
-    overflows = [
-        np.abs(plane) > _HALF_MAX
-        for (plane, _), stored in zip(channels.values(), formats, strict=True)
-        if stored == oiio.HALF
-    ]
-    clipped = int(np.any(overflows, axis=0).sum()) if overflows else 0
-    if clipped:
-        what = f"{clipped} of {overflows[0].size} pixels exceed {_HALF_MAX:g}, the largest half-float, and are clipped"
-        warnings.warn(f"{path}: {what}; 32 bits hold them (half=False, --float)", stacklevel=3)
     pixels = np.stack(planes, axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], formats[0])
     spec.channelformats = tuple(formats)
-    spec.channelnames = tuple(channels)
+    spec.channelnames = tuple(layer.channels)
     if window is not None:
         spec.x, spec.y, spec.full_width, spec.full_height = window
     for name, value in attributes.items():
-        spec.attribute(name, value)
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(chromaticities))
-    _save(path, spec, pixels)
+        if isinstance(value, Fraction):
+            spec.attribute(name, oiio.TypeDesc("rational2i"), (value.numerator, value.denominator))
+        elif isinstance(value, tuple):
+            spec.attribute(name, oiio.TypeDesc("matrix" if len(value) == 16 else f"float[{len(value)}]"), value)
+        else:
+            spec.attribute(name, value)
+    spec.attribute("compression", exr.compression_of(layer.is_color))
+    if layer.name:
+        spec.attribute("oiio:subimagename", layer.name)
+    return spec, pixels
 
 
-def _write_single_layer(
-    path: Path, source: "_Film | Array", exposure: float, tonemap: str, aov: str | None, color_space: str
-) -> None:
+def _write_single_layer(path: Path, source: "_Film | Array", how: _Shown, aov: str | None, color_space: str) -> None:
     """Writes a file of a format without layers."""
     values, alpha = _pixels(source, aov)
     suffix = path.suffix.lower()
@@ -370,29 +470,33 @@ def _write_single_layer(
     if suffix in (".hdr", ".pfm"):
         if suffix == ".hdr":  # stores three channels, which are not negative
             values = np.maximum(np.broadcast_to(values, (*values.shape[:2], 3)), 0.0)
-        _save(path, oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], oiio.FLOAT), values)
+        spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], oiio.FLOAT)
+        _save(path, [spec], [values])
         return
     keeps_alpha = alpha is not None and suffix in (".png", ".tif", ".tiff")
     if keeps_alpha and alpha is not None:
         # Stored unassociated. JPEG has no alpha: premultiplied colour is the picture over black.
         values = np.divide(values, alpha, out=np.zeros_like(values), where=alpha > 0.0)
-    shown = _display(values, aov, exposure, tonemap)
+    shown = _display(values, aov, how)
     if keeps_alpha and alpha is not None:
         shown = np.concatenate([shown, np.clip(alpha, 0.0, 1.0)], axis=-1)
     steps, stored = (65535.0, np.uint16) if suffix in (".tif", ".tiff") else (255.0, np.uint8)
     pixels = np.floor(shown * steps + 0.5).astype(stored)
     kind = oiio.UINT16 if stored == np.uint16 else oiio.UINT8
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec.set_colorspace("sRGB")
+    config = active_config() if how.view is not None and aov in _LIGHT else None
+    spec.set_colorspace("sRGB" if config is None or how.view is None else config.display_space(how.view))
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("Compression", "jpeg:95" if suffix in (".jpg", ".jpeg") else "zip")
-    _save(path, spec, pixels)
+    _save(path, [spec], [pixels])
 
 
-def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> Array:
+def _display(values: Array, aov: str | None, how: _Shown) -> Array:
     """Display values in [0, 1] of the radiance or an AOV."""
-    if aov in (None, "direct", "indirect"):
-        return tone_map(values, exposure, tonemap)
+    if aov in _LIGHT:
+        if how.view is None:
+            return tone_map(values, how.exposure, how.tonemap)
+        return display_values(np.broadcast_to(values, (*values.shape[:2], 3)), how.exposure, how.view)
     if aov == "albedo":
         return srgb_from_linear(values)
     low, high = 0.0, 1.0
@@ -405,11 +509,11 @@ def _display(values: Array, aov: str | None, exposure: float, tonemap: str) -> A
     return shown
 
 
-def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.integer]") -> None:
-    """Writes pixels with OpenImageIO; raises `InputError` if that fails in any way."""
+def _save(path: Path, specs: "Sequence[oiio.ImageSpec]", parts: "Sequence[Array | npt.NDArray[np.integer]]") -> None:
+    """Writes the parts of a file, mostly one, with OpenImageIO; raises `InputError` if that fails in any way."""
     import OpenImageIO as oiio
 
-    if path.suffix.lower() in (".jpg", ".jpeg") and shutil.disk_usage(path.parent).free < 2 * pixels.nbytes:
+    if path.suffix.lower() in (".jpg", ".jpeg") and shutil.disk_usage(path.parent).free < 2 * parts[0].nbytes:
         # libjpeg exits the process when it cannot write.
         raise InputError(f"{path}: cannot be written: no space left on the device")
     with whole_file(path) as temporary:
@@ -417,7 +521,10 @@ def _save(path: Path, spec: "oiio.ImageSpec", pixels: "Array | npt.NDArray[np.in
         if writer is None:
             raise OSError(oiio_error())
         # close() flushes, and geterror() tells of failures that the other calls do not report.
-        good = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
+        good = writer.open(str(temporary), tuple(specs)) if len(specs) > 1 else writer.open(str(temporary), specs[0])
+        for number, (spec, pixels) in enumerate(zip(specs, parts, strict=True)):
+            good = good and (number == 0 or writer.open(str(temporary), spec, "AppendSubimage"))
+            good = good and writer.write_image(np.ascontiguousarray(pixels))
         good = writer.close() and good
         message = oiio_error(writer)
         if message or not good:

@@ -13,7 +13,7 @@ from warp_ir.usd.images.asset import MAX_PIXELS, Image, read_texture
 from warp_ir.usd.images.shading_value import ShadingValue, compact
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.source_color_space import color_space, decoder, rgb_conversion_matrix
+from warp_ir.usd.values.source_color_space import color_space, decoder, rgb_conversion_matrix, space_name
 
 MAX_TEXTURE_PIXELS = 2**27
 """Pixel budget for all images of a scene; each image is averaged down to at most half of what remains."""
@@ -198,7 +198,7 @@ def inherited_color_space(attribute: Usd.Attribute, image: Image) -> str:
         space = color_space(read.color_space_name(attribute))
     except Unreadable:  # colour attributes of the prim have been warned about
         return ""
-    return "" if space is None or image.decoded != (decoder(space) is not None) else str(space.GetName())
+    return "" if space is None or image.decoded != (decoder(space) is not None) else space_name(space)
 
 
 def _channels(image: Image, channels: list[int]) -> Floats:

@@ -14,7 +14,7 @@ from warp_ir.settings import RenderSettings
 from warp_ir.usd.shading.binding import PURPOSES
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
-from warp_ir.usd.values.source_color_space import color_space
+from warp_ir.usd.values.source_color_space import ConfiguredSpace, color_space, decoder, space_name
 
 _NAMESPACE = "warp_ir:"
 """Namespace of attributes that are fields of `RenderSettings`."""
@@ -262,11 +262,12 @@ def _color_space(settings: Usd.Prim, time: Usd.TimeCode, report: Report) -> dict
         return {}
     if space is None:
         return {}
-    if space.GetName() not in COLOR_SPACES:
+    known = space_name(space)
+    if decoder(space) is not None or (known not in COLOR_SPACES and not isinstance(space, ConfiguredSpace)):
         report.warn(settings.GetPath(), f"renderingColorSpace '{name}' is unknown or not linear; Rec. 709 is used")
         return {}
     report.warn(
         settings.GetPath(),
         f"renderingColorSpace '{name}': light is computed in Rec. 709, linear pictures are converted",
     )
-    return {"color_space": str(space.GetName())}
+    return {"color_space": known}
