@@ -33,6 +33,7 @@ LAYERS = [
     ["estimators", "interrupt"],
     ["renderer"],
     ["preview"],
+    ["view"],
     ["cli"],
     ["__main__"],
 ]
@@ -42,7 +43,7 @@ USD_LAYERS = [
     ["lights"],
     ["shading"],
     ["settings"],
-    ["camera_prim", "diagnose", "linking", "time_varying", "vpl_layers"],
+    ["camera_prim", "diagnose", "edit_layer", "linking", "time_varying", "vpl_layers"],
     ["traverse"],
     ["assemble"],
     ["load"],
