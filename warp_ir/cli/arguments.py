@@ -253,6 +253,8 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--float", dest="half", action="store_false", help="store .exr with 32 bits per channel instead of 16"
     )
+    preview = "show the picture while it is rendered, in a window, or in a terminal that can"
+    output.add_argument("--preview", action="store_true", help=preview)
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)

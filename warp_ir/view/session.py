@@ -14,7 +14,9 @@ calls `step` in a thread of its own until `close`.
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -47,6 +49,8 @@ _DIVISORS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 """Ratios of the sides of the window to those of a coarse picture."""
 _LEVEL_DIVISOR = 2.5
 """Largest ratio of the sides of a picture to those of the next coarser one, where the coarser is slow."""
+_LAST_DIVISOR = 1.2
+"""Smallest such ratio for which there is a level at all."""
 _SLOW_SECONDS = 0.5
 """Estimated time of an iteration at full resolution from which coarser levels are shown before [s]."""
 _MOTION_PATHS = 32
@@ -112,6 +116,16 @@ class Frame:
         return f"{self.iterations} iteration{'s' * (self.iterations != 1)}{error}{', converged' * self.converged}"
 
 
+@dataclass(frozen=True, eq=False)
+class _Good:
+    """What was shown last, to which a view goes back from what cannot be shown."""
+
+    scene: Scene
+    time: float | str | None
+    cameras: tuple[Camera, ...]
+    state: ViewState
+
+
 class LiveView:
     """A scene in view. `change` and the methods that call it may be called by any thread, `step` by one."""
 
@@ -163,15 +177,23 @@ class LiveView:
         self.changed = threading.Condition(self._lock)
         """Notified whenever the state changes or a frame is ready."""
         self._closed = False
-        self._interruptible = False
+        self._cancellable = False
         self._changed_at = time.perf_counter()
         self._base = scene
         self._scene, self._scene_of = scene, (id(scene), self.state.edits)
         self._read_time = time_code
         self.cameras = source.cameras(time_code) or (scene.camera,)
+        same_camera = next((camera for camera in self.cameras if camera.name == scene.camera.name), scene.camera)
+        self.state = replace(self.state, camera=same_camera)
         self._pixels = float(_FIRST_PIXELS)
         self._film: Film | None = None
         self._radiance: npt.NDArray[np.float32] | None = None
+        # What the first iteration of the film has seen: other threads read it without waiting for the renderer.
+        self._depth: npt.NDArray[np.float32] = np.zeros((1, 1), np.float32)
+        self._position: npt.NDArray[np.float32] = np.zeros((1, 1, 3), np.float32)
+        self._mesh: npt.NDArray[np.int32] = np.full((1, 1), -1, np.int32)
+        self._good: _Good | None = None
+        self._jobs: deque[Callable[[], None]] = deque()
         self._rendered: ViewState | None = None  # of which `_film` holds iterations
         self._displayed: ViewState | None = None
         self._divisor, self._error, self._due = 1.0, math.nan, 0.0
@@ -196,7 +218,7 @@ class LiveView:
         before, self.state = self.state, replace(self.state, **values)  # type: ignore[arg-type]
         if not _same(before, self.state, _RENDERED):
             self._changed_at = time.perf_counter()
-            if self._interruptible:
+            if self._cancellable:
                 self._renderer.launcher.cancel()
         self.changed.notify_all()
 
@@ -253,10 +275,8 @@ class LiveView:
 
     def pivot(self) -> Floats:
         """The point [3] around which the camera turns: what the middle of the picture shows, else the scene's depth."""
-        camera, film = self.state.camera, self._film
-        depth = 0.0
-        if film is not None and film.iterations:
-            depth = float(film.aov("depth")[film.height // 2, film.width // 2])
+        camera, seen = self.state.camera, self._depth
+        depth = float(seen[seen.shape[0] // 2, seen.shape[1] // 2])
         if depth <= 0.0:
             lower, upper = self._base.bounds()
             to_centre = camera.world_from_camera[:3, 3] - 0.5 * (lower + upper)
@@ -268,34 +288,48 @@ class LiveView:
 
         None: no surface.
         """
-        film, scene = self._film, self._scene
-        if film is None or not film.iterations or not (0.0 <= column < 1.0 and 0.0 <= row < 1.0):
+        mesh, position, scene = self._mesh, self._position, self._scene
+        if not (0.0 <= column < 1.0 and 0.0 <= row < 1.0) or position.shape[:2] != mesh.shape:
             return None
-        x, y = int(column * film.width), int(row * film.height)
-        mesh = int(film.aov("prim_id")[y, x])
-        if not 0 <= mesh < len(scene.meshes):
+        y, x = int(row * mesh.shape[0]), int(column * mesh.shape[1])
+        index = int(mesh[y, x])
+        if not 0 <= index < len(scene.meshes):
             return None
-        return surface_at(scene, mesh, film.aov("position")[y, x].astype(np.float64))
+        return surface_at(scene, index, position[y, x].astype(np.float64))
 
     def save_picture(self, path: Path) -> None:
-        """Writes the picture as `render` would: radiance, or tone-mapped with the exposure of the view."""
-        film, state = self._film, self.state
-        if film is None or not film.iterations:
-            raise InputError(f"{path}: there is no picture yet")
-        write_image(path, film, exposure=state.exposure, tonemap=state.tonemap)
-        self.say(f"{path}: {film.width} x {film.height}, {film.iterations} iterations")
+        """Has the picture written as `render` would: radiance, or tone-mapped with the exposure of the view."""
+
+        def save() -> None:
+            film, state = self._film, self.state
+            if film is None:
+                raise InputError(f"{path}: there is no picture yet")
+            write_image(path, film, exposure=state.exposure, tonemap=state.tonemap)
+            self.say(f"{path}: {film.width} x {film.height}, {film.iterations} iterations")
+
+        self._put(save)
 
     def save_edits(self, path: Path) -> None:
-        """Writes camera, lights and colours as a layer for `render --session-layer`."""
-        state = self.state
-        left_out = self.source.save_edits(path, state.time, state.camera, state.edits)
-        self.say(f"{path}: for --session-layer{''.join(f'; {line}' for line in left_out)}")
+        """Has camera, lights and colours written as a layer for `render --session-layer`."""
+
+        def save() -> None:
+            state = self.state
+            left_out = self.source.save_edits(path, state.time, state.camera, state.edits)
+            self.say(f"{path}: for --session-layer{''.join(f'; {line}' for line in left_out)}")
+
+        self._put(save)
+
+    def _put(self, job: Callable[[], None]) -> None:
+        """Leaves a job to the thread that renders."""
+        with self._lock:
+            self._jobs.append(job)
+            self.changed.notify_all()
 
     def close(self) -> None:
         """Ends `run`."""
         with self._lock:
             self._closed = True
-            if self._interruptible:
+            if self._cancellable:
                 self._renderer.launcher.cancel()
             self.changed.notify_all()
 
@@ -314,85 +348,90 @@ class LiveView:
                 show(frame)
                 continue
             with self._lock:
-                if not self._closed and self.state is self._displayed:
+                if not self._closed and self.state is self._displayed and not self._jobs:
                     self.changed.wait(0.03)
 
     def step(self) -> Frame | None:
         """Does one piece of work; None if it has made no frame."""
+        while self._jobs and self._film is not None:
+            try:
+                self._jobs.popleft()()
+            except InputError as error:
+                self.say(str(error))
         state, changed_at = self._read_source()
-        if self._rendered is None or not _same(self._rendered, state, _RENDERED):
+        if self._film is None or not _same(state, self._rendered, _RENDERED):
             return self._show_motion(state, changed_at)
         if self._displayed is not state and self._displayed is not None:
             return self._frame(state, time.perf_counter() - changed_at)
         if time.perf_counter() - changed_at < _REST_SECONDS:
             return None
         try:
-            with self._interruptions():
-                return self._refine(state, changed_at)
+            return self._refine(state, changed_at)
         except Cancelled:
             return None
 
     def _show_motion(self, state: ViewState, changed_at: float) -> Frame:
         """One iteration of as many pixels as there is time for."""
-        divisor = self._motion_divisor(state)
         begin = time.perf_counter()
         try:
-            self._begin_film(state, divisor)
-        except InputError as error:  # the settings or the edits do not fit the scene
-            self.say(str(error))
-            with self._lock:
-                if self._rendered is None:
-                    raise
-                self.state = replace(self._rendered)
-            state = self.state
-            self._begin_film(state, divisor)
-        self._add_iteration()
+            self._prepare(state, self._motion_divisor(state))
+        except InputError as error:  # the scene, the settings or the edits cannot be used
+            if self._good is None:
+                raise
+            self.say(f"not shown: {error}")
+            state = self._go_back(self._good)
+            self._prepare(state, self._motion_divisor(state))
+        self._good = _Good(self._base, self._read_time, self.cameras, state)
+        self._begin_film(state)
         frame = self._frame(state, 0.0, made=True)
-        seconds = time.perf_counter() - begin
-        pixels = frame.pixels.shape[0] * frame.pixels.shape[1] if not state.vpls else self._count()
-        self._adapt(pixels, seconds)
-        return replace(frame, seconds=time.perf_counter() - changed_at)
+        now = time.perf_counter()
+        self._adapt(self._depth.size, now - begin)
+        return replace(frame, seconds=now - changed_at)
 
     def _refine(self, state: ViewState, changed_at: float) -> Frame | None:
         """The next finer level, or an iteration at full resolution; a frame when it is due."""
         now = time.perf_counter()
         if self._divisor > 1.0:
-            full = state.width * state.height
-            seconds = MOTION_SECONDS * full / self._pixels
+            seconds = MOTION_SECONDS * state.width * state.height / self._pixels
             finer = self._divisor / _LEVEL_DIVISOR
-            self._begin_film(state, finer if seconds > _SLOW_SECONDS and finer > 1.2 else 1.0)
-            self._add_iteration()
-            return self._frame(state, time.perf_counter() - changed_at, made=True)
-        assert self._film is not None
+            self._prepare(state, finer if seconds > _SLOW_SECONDS and finer > _LAST_DIVISOR else 1.0)
+            with self._interruptible(state):
+                self._begin_film(state)
+                return self._frame(state, time.perf_counter() - changed_at, made=True)
+        film = self._film
+        assert film is not None
         if self._converged:
             return None
-        self._add_iteration()
         limit = self._settings.iterations or _MOST_ITERATIONS
-        film = self._film
-        if time.perf_counter() < self._due and film.iterations < limit:
-            return None
-        if film.iterations.bit_count() == 1:
-            film.measure_noise()
-        frame = self._frame(state, 0.0, made=True)
-        self._error = film.error()
-        self._converged = film.iterations >= limit or self._error <= (self._settings.target_error or _TARGET_ERROR)
+        with self._interruptible(state):
+            if film.iterations < limit:
+                self._renderer.add_iteration(film, film.iterations)
+            if time.perf_counter() < self._due and film.iterations < limit:
+                return None
+            if film.iterations.bit_count() == 1:
+                film.measure_noise()
+            frame = self._frame(state, 0.0, made=True)
+            error = film.error()
+        self._error = error
+        self._converged = film.iterations >= limit or error <= (self._settings.target_error or _TARGET_ERROR)
         done = time.perf_counter()
         self._due = done + (done - now) * (1.0 / _PICTURE_SHARE - 1.0)
-        return replace(frame, error=self._error, converged=self._converged)
+        return replace(frame, error=error, converged=self._converged)
 
-    def _begin_film(self, state: ViewState, divisor: float) -> None:
-        """An empty film of the view, with the sides of the window divided by a number."""
+    def _prepare(self, state: ViewState, divisor: float) -> None:
+        """Takes the renderer to the view, with the sides of the window divided by a number."""
+        self._film, self._divisor = None, divisor
         self._renderer.update(self._with_camera(self._edited(state), state), self._settings_of(state, divisor))
-        self._film = self._renderer.new_film()
-        self._divisor = divisor if self._count() < state.width * state.height else 1.0
-        self._rendered, self._converged, self._error, self._due = state, False, math.nan, 0.0
 
-    def _add_iteration(self) -> None:
-        assert self._film is not None
-        self._renderer.add_iteration(self._film, self._film.iterations)
-
-    def _count(self) -> int:
-        return 0 if self._film is None else self._film.width * self._film.height
+    def _begin_film(self, state: ViewState) -> None:
+        """A film of the view with one iteration, and what that has seen."""
+        film = self._renderer.new_film()
+        self._renderer.add_iteration(film, 0)
+        self._depth, self._position, self._mesh = (film.aov(name) for name in ("depth", "position", "prim_id"))
+        if film.width * film.height >= state.width * state.height:
+            self._divisor = 1.0
+        self._film, self._rendered = film, state
+        self._converged, self._error, self._due = False, math.nan, 0.0
 
     def _frame(self, state: ViewState, seconds: float, *, made: bool = False) -> Frame:
         """A frame of the film's picture; with `made`, of a picture that is made now."""
@@ -406,7 +445,7 @@ class LiveView:
         pixels = display_pixels(self._radiance, state.exposure, state.tonemap)
         if state.vpls:
             full = scaled(pixels, state.width, state.height)
-            pixels = draw_vpls(full, self._overlay(state), self._fitted(state), film.aov("depth"))
+            pixels = draw_vpls(full, self._overlay(state), self._fitted(state), self._depth)
         self._displayed = state
         return Frame(pixels, state, self._divisor > 1.0, film.iterations, self._error, self._converged, seconds)
 
@@ -477,6 +516,13 @@ class LiveView:
                 self.state = replace(self.state, camera=after.get(camera.name, camera))
             self._changed_at = time.perf_counter()
 
+    def _go_back(self, good: _Good) -> ViewState:
+        """Shows again what could be shown."""
+        with self._lock:
+            self._base, self._read_time, self.cameras = good.scene, good.time, good.cameras
+            self.state = replace(good.state)
+            return self.state
+
     def _edited(self, state: ViewState) -> Scene:
         """The scene with the edits; the same object as long as neither changes."""
         key = (id(self._base), state.edits)
@@ -521,28 +567,19 @@ class LiveView:
         if not 0.8 < ratio < 1.25:
             self._pixels = max(self._pixels * min(max(ratio, 0.25), 4.0) ** 0.7, _FIRST_PIXELS)
 
-    def _interruptions(self) -> "_Interruptible":
-        return _Interruptible(self)
-
-
-class _Interruptible:
-    """A context in which a change of the view cancels the launches of its renderer."""
-
-    def __init__(self, view: LiveView) -> None:
-        self._view = view
-
-    def __enter__(self) -> None:
-        view = self._view
-        with view._lock:
-            if not _same(view.state, view._rendered, _RENDERED):
+    @contextmanager
+    def _interruptible(self, state: ViewState) -> Iterator[None]:
+        """A change of what is rendered cancels the launches inside, which raise `Cancelled`."""
+        with self._lock:
+            if self._closed or not _same(self.state, state, _RENDERED):
                 raise Cancelled
-            view._interruptible = True
-
-    def __exit__(self, *_: object) -> None:
-        view = self._view
-        with view._lock:
-            view._interruptible = False
-            view._renderer.launcher.resume()
+            self._cancellable = True
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._cancellable = False
+                self._renderer.launcher.resume()
 
 
 def _same(one: ViewState, other: ViewState | None, names: tuple[str, ...]) -> bool:

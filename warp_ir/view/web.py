@@ -37,7 +37,8 @@ _STYLE = (
     " .text { position: fixed; left: 8px; color: white; background: rgba(0, 0, 0, 0.6); font: 12px monospace;"
     " padding: 4px; white-space: pre; pointer-events: none }"
     " .panel { position: fixed; right: 8px; top: 8px; width: 250px; color: white; background: rgba(0, 0, 0, 0.6);"
-    " font: 12px sans-serif; padding: 8px; max-height: 95vh; overflow-y: auto } .panel > * { width: 100%; margin-bottom: 4px }"
+    " font: 12px sans-serif; padding: 8px; max-height: 95vh; overflow-y: auto }"
+    " .panel > * { width: 100%; margin-bottom: 4px }"
     " .panel input, .panel select, .panel button { color: white; background: #333; width: 100% }"
 )
 
