@@ -288,6 +288,7 @@ def settle(view, seconds=60.0):
     raise AssertionError("did not converge")
 
 
+@pytest.mark.extended
 def test_a_resting_view_refines_until_it_has_converged():
     """The first picture is there at once; then iterations are added until their limit, and then nothing happens."""
     view = view_of(iterations=6)
@@ -309,6 +310,7 @@ def test_motion_is_coarse_and_never_blank():
         assert frame.state.camera is view.state.camera
 
 
+@pytest.mark.extended
 def test_a_motion_interrupts_the_work_on_a_resting_picture():
     """A change during an iteration cancels it: the step ends without a frame, and the next shows the change."""
     view = view_of(width=320, height=180, iterations=1000)
@@ -341,6 +343,7 @@ def test_display_changes_render_nothing():
     assert 60 < automatic.pixels.mean() < 180 and view.state.exposure != 2.0
 
 
+@pytest.mark.extended
 def test_bounces_by_hand_are_the_series():
     """Direct light alone is darker than with one bounce, and that darker than all."""
     view = view_of(iterations=8)
@@ -352,6 +355,7 @@ def test_bounces_by_hand_are_the_series():
     assert means[0] < 0.9 * means[1] and means[1] < 0.95 * means[2]
 
 
+@pytest.mark.extended
 def test_resizing_renders_the_new_size():
     """Any size of the window is rendered, down to one pixel."""
     view = view_of(iterations=2)
@@ -360,6 +364,7 @@ def test_resizing_renders_the_new_size():
         assert settle(view).pixels.shape == (max(height, 1), max(width, 1), 3)
 
 
+@pytest.mark.extended
 def test_scenes_without_light_or_geometry_are_shown():
     """A dark scene, and an empty one, are black pictures and no error."""
     dark = replace(lamp_scene(), lights=(), materials=(Material("/A"),) * 3)
@@ -377,6 +382,7 @@ def test_scenes_without_light_or_geometry_are_shown():
         assert next_frame(view).pixels.shape[2] == 3
 
 
+@pytest.mark.extended
 def test_light_edits_scale_the_picture():
     """Four times the light is four times the radiance, with the same light paths: the same noise."""
     view = view_of(SceneSource(lamp_scene()), iterations=2)
@@ -399,6 +405,7 @@ def test_unusable_edits_keep_what_was_shown():
     assert "max_bounces" in view.message and view.state.max_bounces is None and frame.pixels.any()
 
 
+@pytest.mark.extended
 def test_surfaces_are_picked_where_they_are_seen():
     """The left wall of the box is red, the right one green; what is picked there is painted."""
     view = view_of(width=64, height=64, iterations=2)
@@ -417,6 +424,7 @@ def settle_pixels(view):
     return display_pixels(view._radiance, 0.0, "srgb")
 
 
+@pytest.mark.extended
 def test_vpls_lie_over_the_picture():
     """The overlay changes some pixels, keeps the others, and has the size of the window even over a coarse picture."""
     view = view_of(width=200, height=200, iterations=1)
@@ -577,6 +585,7 @@ def touch(path, text):
     os.utime(path, ns=(stamp, stamp))
 
 
+@pytest.mark.extended
 def test_a_changed_stage_is_read_again(tmp_path):
     """A brighter light in the file is brighter in the view, whose camera stays; a broken file changes nothing."""
     layer, root = tmp_path / "layer.usda", tmp_path / "root.usda"
