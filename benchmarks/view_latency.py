@@ -97,7 +97,7 @@ def measure_window(stage: str, events: int, size: tuple[int, int]) -> dict[str, 
 
 
 def use_for(stage: str, seconds: float, size: tuple[int, int]) -> dict[str, float]:
-    """All that a user does, in turn, for some time; the memory in the first and in the last fifth of it."""
+    """All that a user does, in turn, for some time; the largest memory in the first and in the second half of it."""
     view = open_view(stage, size)
     controls = Controls(view)
     generator = np.random.default_rng(0)
@@ -123,17 +123,16 @@ def use_for(stage: str, seconds: float, size: tuple[int, int]) -> dict[str, floa
             controls.switch_light()
             controls.switch_light()
         elif action == 6:
-            view.resize(int(generator.integers(1, 2 * size[0])), int(generator.integers(1, 2 * size[1])))
+            view.resize(int(generator.integers(1, size[0])), int(generator.integers(1, size[1])))
         else:
             view.change(camera=home, width=size[0], height=size[1])
         rest = time.perf_counter() + 0.5
         while time.perf_counter() < rest:
             frames += view.step() is not None
-        memory.append((now, resident_bytes()))
-    fifth = seconds / 5.0
-    early = np.median([m for t, m in memory if fifth < t < 2 * fifth])
-    late = np.median([m for t, m in memory if t > 4 * fifth])
-    return {"frames": frames, "worst_s": round(worst, 3), "early_MiB": early / 2**20, "late_MiB": late / 2**20}
+        memory.append((now, resident_bytes() / 2**20))
+    early = max(m for t, m in memory if t <= 0.5 * seconds)
+    late = max(m for t, m in memory if t > 0.5 * seconds)
+    return {"frames": frames, "worst_s": round(worst, 3), "early_MiB": round(early), "late_MiB": round(late)}
 
 
 def open_view(stage: str, size: tuple[int, int]) -> LiveView:

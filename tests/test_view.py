@@ -519,6 +519,20 @@ def test_dragging_and_walking():
     assert place(view.state.camera)[2] == walked < before[2]
 
 
+def test_inside_of_a_room_one_looks_around():
+    """Dragging in a room turns the head; seen from outside, the room."""
+    inside = Camera.look_at((0.2, 1.0, 0.0), (1, 1, 0))
+    for camera, looks in ((inside, True), (EYE, False)):
+        view = FakeView()
+        view.scene = replace(view.scene, meshes=(*view.scene.meshes, quad("/Far", [[-2, -1, 2]] * 4)))
+        view.state.camera = camera
+        controls = Controls(view)
+        assert controls.first_person == looks
+        controls.press("left", 0.5, 0.5)
+        controls.drag(0.6, 0.5)
+        assert (place(view.state.camera) == place(camera)).all() == looks
+
+
 def test_keys_for_lights_cameras_and_time():
     """Choosing, switching, scaling, moving; cameras in a ring; frames from the first to the last and around."""
     view = FakeView()

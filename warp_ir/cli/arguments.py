@@ -86,9 +86,9 @@ examples:
   warp-ir vpls room.usda lights.usda --as-lights
 """
 _VIEW_NOTES = """\
-Dragging orbits, the wheel moves closer, w a s d walk, F1 lists all keys. The
-picture is coarse while it moves and refines while it rests. Files of the stage
-that change are read again.
+Dragging orbits, or looks around inside of a room; the wheel moves closer, the
+keys w a s d walk, and F1 lists the others. The picture is coarse while it moves
+and refines while it rests. Files of the stage that change are read again.
 
 examples:
   # look around in a room

@@ -62,7 +62,7 @@ class Controls:
     layer: Path = Path("view_edits.usda")
     """File that the edits are saved to."""
     first_person: bool = False
-    """Whether dragging turns the head, not the scene."""
+    """Whether dragging turns the head, not the scene: at first where the camera is inside, and orbits end in walls."""
     show_help: bool = False
     show_panel: bool = False
     """Whether sliders are shown."""
@@ -78,6 +78,9 @@ class Controls:
 
     def __post_init__(self) -> None:
         self.light = next(iter(self.view.lights), "")
+        lower, upper = self.view.scene.bounds()
+        eye = self.view.state.camera.world_from_camera[:3, 3]
+        self.first_person = bool((eye > lower).all() and (eye < upper).all())
 
     # The pointer
 

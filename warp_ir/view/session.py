@@ -42,7 +42,10 @@ MOTION_SECONDS = 0.07
 _REST_SECONDS = 0.15
 """Time without a change after which a picture is refined [s]."""
 _FIRST_PIXELS = 96 * 54
-"""Pixels of the first picture, from whose time those of the following ones are chosen; they have no fewer."""
+"""Pixels of the first picture, from whose time those of the following ones are chosen."""
+_LONGEST_SECONDS = 0.15
+"""Time that a picture may take rather than have fewer pixels than the first one [s]."""
+_FEWEST_PIXELS = 64 * 36
 _FIXED_SECONDS = 0.025
 """Part of that time that does not depend on the number of pixels: launches, and the uploading of a camera [s]."""
 _DIVISORS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
@@ -563,9 +566,12 @@ class LiveView:
     def _adapt(self, pixels: int, seconds: float) -> None:
         """Chooses the number of pixels of the next picture of a motion by the time that one took."""
         per_pixel = max(seconds - _FIXED_SECONDS, 0.2 * seconds) / pixels
-        ratio = (MOTION_SECONDS - _FIXED_SECONDS) / per_pixel / self._pixels
+        wanted = (MOTION_SECONDS - _FIXED_SECONDS) / per_pixel
+        if wanted < _FIRST_PIXELS:
+            wanted = min((_LONGEST_SECONDS - _FIXED_SECONDS) / per_pixel, _FIRST_PIXELS)
+        ratio = wanted / self._pixels
         if not 0.8 < ratio < 1.25:
-            self._pixels = max(self._pixels * min(max(ratio, 0.25), 4.0) ** 0.7, _FIRST_PIXELS)
+            self._pixels = max(self._pixels * min(max(ratio, 0.25), 4.0) ** 0.7, _FEWEST_PIXELS)
 
     @contextmanager
     def _interruptible(self, state: ViewState) -> Iterator[None]:

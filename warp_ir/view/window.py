@@ -25,6 +25,8 @@ _KEYS = {"Prior": "PageUp", "Next": "PageDown", "plus": "+", "minus": "-", "KP_A
 _NO_DISPLAY = "no display to open a window on; --web shows it in a browser"
 _FONT_SIZE = 12
 _BUTTONS = ("Left", "Middle", "Right")
+_TITLE_PIXELS = 12
+"""Height of the titles of sliders."""
 _leaked: list[object] = []
 """Windows of a display that is gone: destroying them would talk to it."""
 
@@ -319,8 +321,6 @@ class ViewWindow:
             shape.SetSliderWidth(0.025)
             shape.SetTubeWidth(0.005)
             shape.SetEndCapLength(0.0)
-            shape.SetTitleHeight(0.022)
-            shape.SetLabelHeight(0.02)
             widget: Any = vtkSliderWidget()
             widget.SetInteractor(self.picture.interactor)
             widget.SetRepresentation(shape)
@@ -331,7 +331,7 @@ class ViewWindow:
     def _update_sliders(self) -> None:
         """Shows the sliders that are wanted, at the values of the view; those of a colour once a surface is picked."""
         state, controls = self.view.state, self.controls
-        edit = state.edits.light(controls.light)
+        edit, height = state.edits.light(controls.light), max(self.picture.size[1], _TITLE_PIXELS)
         values = [
             state.exposure,
             10.0 if state.max_bounces is None else float(state.max_bounces),
@@ -342,7 +342,10 @@ class ViewWindow:
             wanted = bool(controls.surface) if k >= 3 else controls.show_panel
             if bool(widget.GetEnabled()) != wanted:
                 widget.SetEnabled(wanted)
-            widget.GetRepresentation().SetValue(value)
+            shape = widget.GetRepresentation()
+            shape.SetValue(value)
+            shape.SetTitleHeight(_TITLE_PIXELS / height)
+            shape.SetLabelHeight(_TITLE_PIXELS / height)
 
 
 def show_view(view: LiveView, controls: Controls, title: str) -> None:
