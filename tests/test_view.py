@@ -1,7 +1,9 @@
 """The live view without a window: camera controls, edits, pixels, controls, and what it renders next."""
 
+import base64
 import io
 import math
+import re
 import threading
 import time
 from dataclasses import replace
@@ -224,8 +226,6 @@ def test_sixels_draw_the_picture():
     text = terminal.sixels(pixels)
     body = text[text.index("#") : -2]
     palette, shown = {}, np.full((18, 9, 3), -1.0)
-    import re
-
     x = top = color = 0
     for token in re.findall(r"#\d+(?:;[\d;]+)?|!\d+.|[$-]|[?-~]", body):
         if token[0] == "#" and ";" in token:
@@ -247,10 +247,19 @@ def test_sixels_draw_the_picture():
     assert (shown[13:] == -1).all()
 
 
+def test_pictures_for_terminals_are_png(tmp_path):
+    """What kitty is sent, put together from its messages, is the picture."""
+    pixels = np.random.default_rng(2).integers(0, 256, (70, 90, 3)).astype(np.uint8)
+    messages = re.findall(r"\x1b_G([^;]*);([^\x1b]*)\x1b", terminal.kitty(pixels, 9, 7))
+    assert len(messages) > 1 and all(len(body) <= 4096 for _, body in messages)
+    path = tmp_path / "a.png"
+    path.write_bytes(base64.b64decode("".join(body for _, body in messages)))
+    assert (np.round(255.0 * read_image(path)) == pixels).all()
+
+
 @pytest.mark.parametrize("protocol", ["kitty", "iterm", "sixel", "blocks"])
 def test_the_next_picture_replaces_the_last(protocol):
     """The cursor goes up by the rows of the picture and its line before the next one."""
-    pytest.importorskip("imageio")
     stream = io.StringIO()
     shown = terminal.TerminalPicture(stream, protocol)
     shown.show(np.zeros((9, 16, 3), np.uint8), "one")
@@ -650,6 +659,19 @@ def test_saved_edits_give_the_picture_of_the_view(tmp_path):
     assert loaded.lights[0].world_from_light == pytest.approx(edited.lights[0].world_from_light)
     wall = loaded.materials[int(loaded.meshes[0].material[0])]
     assert wall.albedo == pytest.approx((0.1, 0.2, 0.3))
+
+
+def test_a_layer_says_which_camera_it_needs(tmp_path):
+    """Edits of a camera that is not rendered by default: the message names the flag; a new camera is rendered."""
+    path = tmp_path / "stage.usda"
+    path.write_text(STAGE, encoding="utf-8")
+    source = stage_source(path)
+    first, other = source.cameras(None)
+    assert source.save_edits(tmp_path / "a.usda", None, first, Edits()) == []
+    assert source.save_edits(tmp_path / "b.usda", None, other, Edits()) == ["render it with --camera /other"]
+    assert source.save_edits(tmp_path / "c.usda", None, EYE, Edits()) == []
+    loaded = load_usd(path, session_layer=tmp_path / "c.usda").camera
+    assert loaded.name == "/main_cam" and loaded.world_from_camera == pytest.approx(EYE.world_from_camera)
 
 
 @pytest.mark.parametrize("name", ["cornell_box", "light_types", "two_rooms"])

@@ -24,7 +24,7 @@ _PICTURE_ONLY = {
     *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space", "filter", "denoise"),
 }
 """Settings that affect the picture but not the light paths: `warp-ir vpls` has no flags for them."""
-_NOT_IN_VIEW = {"time_limit", "data_window", "motion_blur", "color_space", "denoise"}
+_NOT_IN_VIEW = {"time_limit", "data_window", "pixel_aspect", "motion_blur", "color_space", "denoise"}
 """Settings that a live view does not have."""
 VPL_DRAWING = ("view", "color_by", "bounces", "min_contribution", "paths", "order")
 """Flags of `warp-ir vpls` that only a drawing has; None if they are not given."""

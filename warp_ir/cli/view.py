@@ -4,11 +4,12 @@ import argparse
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from warp_ir.cli.arguments import settings_of
+from warp_ir.cli.arguments import given_settings, settings_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.import_guard import importing
@@ -16,7 +17,12 @@ from warp_ir.cli.stage_options import open_reader, time_code_of
 from warp_ir.image.io import SUFFIXES, check_output
 
 if TYPE_CHECKING:
+    from warp_ir.scene import Scene
+    from warp_ir.settings import RenderSettings
     from warp_ir.view.controls import Controls
+
+_LARGEST = 1280, 720
+"""Largest window that is opened unless a size is given [pixels]."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,9 +43,14 @@ def run(args: argparse.Namespace) -> int:
     with ProgressDisplay("opening", quiet=args.quiet):
         source = StageSource(lambda: open_reader(args))
         scene = source.read(time_code_of(args))
+        settings = settings_of(args, scene.settings)
+        if not given_settings(args).keys() & {"width", "height"}:  # a stage may ask for more than a screen holds
+            shrink = min(1.0, *(most / side for most, side in zip(_LARGEST, _size(settings, scene), strict=True)))
+            width, height = (max(round(shrink * side), 1) for side in _size(settings, scene))
+            settings = replace(settings, width=width, height=height)
         view = LiveView(
             source,
-            settings_of(args, scene.settings),
+            settings,
             time_code=time_code_of(args),
             exposure=args.exposure,
             tonemap=args.tonemap,
@@ -63,6 +74,12 @@ def run(args: argparse.Namespace) -> int:
         say("interrupted" if arrived[0] == signal.SIGINT else "terminated")
         return 128 + arrived[0]
     return 0
+
+
+def _size(settings: "RenderSettings", scene: "Scene") -> tuple[int, int]:
+    """Width and height of the picture that the settings ask for."""
+    resolved = settings.resolve(scene.camera.aspect)
+    return resolved.width, resolved.height
 
 
 @contextmanager

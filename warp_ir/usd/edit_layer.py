@@ -9,7 +9,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender, UsdShade, Vt
 
 from warp_ir.image.io import whole_file
 from warp_ir.scene import Camera, Color, Floats, Projection
+from warp_ir.usd.camera_prim import find_camera
 from warp_ir.usd.stage.open import quiet_diagnostics, time_code
+from warp_ir.usd.values.report import Report
 
 _CAMERA = "/main_cam"
 """Path of a camera that is none of the stage: of all cameras, that of this name is the one that is rendered."""
@@ -29,7 +31,7 @@ def write_edits(
     lights: Mapping[str, tuple[float, tuple[float, float, float]]],
     colors: Mapping[str, Color],
 ) -> list[str]:
-    """Writes a layer for `--session-layer`; returns a line for each edit that a layer cannot hold.
+    """Writes a layer for `--session-layer`; returns a line for each edit that it cannot hold, or needs help with.
 
     Args:
         path: The file, .usda, .usdc or .usd.
@@ -49,7 +51,7 @@ def write_edits(
         code = time_code(stage, time)
         with Usd.EditContext(edited, layer):
             if camera is not None:
-                _write_camera(edited, camera)
+                left_out += _write_camera(edited, camera)
             for name, (gain, offset) in lights.items():
                 prim = _editable(edited, name)
                 if prim is None or not _write_light(prim, gain, offset, code):
@@ -71,14 +73,16 @@ def _editable(stage: Usd.Stage, name: str) -> Usd.Prim | None:
     return prim
 
 
-def _write_camera(stage: Usd.Stage, camera: Camera) -> None:
+def _write_camera(stage: Usd.Stage, camera: Camera) -> list[str]:
+    """Writes a camera; returns a line if it is not the one that is rendered by default."""
     prim = _editable(stage, camera.name)
     if prim is None or not prim.IsA(UsdGeom.Camera):
         prim = UsdGeom.Camera.Define(stage, _CAMERA).GetPrim()
+    named = False
     for settings in [p for p in stage.Traverse() if p.IsA(UsdRender.Settings) or p.IsA(UsdRender.Product)]:
         relationship = settings.GetRelationship("camera")
         if relationship and relationship.GetTargets():
-            relationship.SetTargets([prim.GetPath()])
+            named = relationship.SetTargets([prim.GetPath()])
     usd = UsdGeom.Camera(prim)
     _set_world_transform(prim, camera.world_from_camera)
     left, right, bottom, top = camera.window
@@ -98,6 +102,9 @@ def _write_camera(stage: Usd.Stage, camera: Camera) -> None:
         usd.CreateFocusDistanceAttr(camera.focus_distance)
     elif usd.GetFStopAttr().HasAuthoredValue():
         usd.CreateFStopAttr(0.0)
+    if named or find_camera(stage, None, "", Report("")) == prim:
+        return []
+    return [f"render it with --camera {prim.GetPath()}"]
 
 
 def _set_world_transform(prim: Usd.Prim, world: Floats) -> None:

@@ -63,6 +63,8 @@ _PICTURE_SHARE = 0.25
 _TARGET_ERROR = 0.005
 """Error at which a resting view has converged, if no other limit is set."""
 _MOST_ITERATIONS = 4096
+_UNLIT_ITERATIONS = 64
+"""Iterations after which a view without any light is left as it is."""
 _EASE = 0.35
 """Fraction of the way to the automatic exposure that a picture of a motion goes: no flicker."""
 _OVERLAY_PATHS = 512
@@ -161,7 +163,16 @@ class LiveView:
         scene = source.read(time_code)
         settings = settings or RenderSettings(**scene.settings)
         resolved = settings.resolve(scene.camera.aspect)
-        self._settings = replace(settings, width=resolved.width, height=resolved.height, motion_blur=False)
+        self._settings = replace(
+            settings,
+            width=resolved.width,
+            height=resolved.height,
+            motion_blur=False,
+            denoise=False,
+            # A window is all of its picture, in square pixels.
+            data_window=(0.0, 0.0, 1.0, 1.0),
+            pixel_aspect=1.0,
+        )
         self.state = ViewState(
             camera=scene.camera,
             width=resolved.width,
@@ -416,7 +427,9 @@ class LiveView:
             frame = self._frame(state, 0.0, made=True)
             error = film.error()
         self._error = error
-        self._converged = film.iterations >= limit or error <= (self._settings.target_error or _TARGET_ERROR)
+        given_up = film.iterations >= _UNLIT_ITERATIONS and film.is_unlit()
+        good = error <= (self._settings.target_error or _TARGET_ERROR)
+        self._converged = good or given_up or film.iterations >= limit
         done = time.perf_counter()
         self._due = done + (done - now) * (1.0 / _PICTURE_SHARE - 1.0)
         return replace(frame, error=error, converged=self._converged)

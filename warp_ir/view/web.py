@@ -62,6 +62,7 @@ class ViewServer:
             InputError: The extra `view` is not installed.
         """
         try:
+            import imageio.v3  # noqa: F401  # writes the pictures
             from trame.app import get_server
         except ImportError:
             raise InputError("--web: needs trame; pip install 'warp-ir[view]'") from None
