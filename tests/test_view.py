@@ -650,7 +650,7 @@ def test_saved_edits_give_the_picture_of_the_view(tmp_path):
     edited = replace(view.state.edits.apply(view.scene), camera=view.state.camera)
     next_frame(view)
     view.save_edits(tmp_path / "edits.usda")
-    view.step()
+    settle(view)
     assert "--session-layer" in view.message and ";" not in view.message
     loaded = load_usd(path, session_layer=tmp_path / "edits.usda")
     assert loaded.camera.world_from_camera == pytest.approx(edited.camera.world_from_camera)

@@ -8,6 +8,7 @@ import os
 import select
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -190,6 +191,15 @@ def test_no_display_is_one_line(tmp_path):
         with running(tmp_path, "view", BOX, display=name) as process:
             code, errors = ended(process)
         assert code == 2 and errors.count("\n") == 0 and "no display" in errors
+
+
+def test_an_address_in_use_is_one_line(tmp_path):
+    """Another server listens there, or the host is unknown: one line, exit code 2, before the stage is read."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        for address in (other.getsockname()[1], "host.invalid:8080"):
+            with running(tmp_path, "view", BOX, "--web", address) as process:
+                code, errors = ended(process)
+            assert code == 2 and errors.count("\n") == 0 and "cannot be used" in errors
 
 
 @needs_xvfb

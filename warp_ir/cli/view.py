@@ -15,6 +15,7 @@ from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.import_guard import importing
 from warp_ir.cli.stage_options import open_reader, time_code_of
 from warp_ir.image.io import SUFFIXES, check_output
+from warp_ir.view.access import check_address, check_display
 
 if TYPE_CHECKING:
     from warp_ir.scene import Scene
@@ -31,14 +32,19 @@ def run(args: argparse.Namespace) -> int:
     check_output(args.picture, SUFFIXES)
     check_output(args.edits, (".usda", ".usdc", ".usd"))
     if args.web is None:
-        from warp_ir.view.window import check_display
-
         check_display()
+    else:
+        check_address(*args.web)
     device = open_device(args.device, verbose=args.verbose)
     with importing():
         from warp_ir.view.controls import Controls
         from warp_ir.view.session import LiveView
         from warp_ir.view.source import StageSource
+
+        if args.web is None:
+            from warp_ir.view.window import show_view
+        else:
+            from warp_ir.view.web import serve_view
 
     with ProgressDisplay("opening", quiet=args.quiet):
         source = StageSource(lambda: open_reader(args))
@@ -62,13 +68,9 @@ def run(args: argparse.Namespace) -> int:
     controls = Controls(view, picture=Path(args.picture), layer=Path(args.edits))
     with _closing_on_signal(controls) as arrived:
         if args.web is not None:
-            from warp_ir.view.web import serve_view
-
             host, port = args.web
             serve_view(view, controls, args.stage, host, port, lambda line: print(line, flush=True))
         else:
-            from warp_ir.view.window import show_view
-
             show_view(view, controls, f"{args.stage} - warp-ir")
     if arrived:
         say("interrupted" if arrived[0] == signal.SIGINT else "terminated")

@@ -236,11 +236,11 @@ class Controls:
 
     def save_picture(self) -> None:
         """Writes the picture to a file that does not exist yet."""
-        self.view.save_picture(_unused(self.picture))
+        self.view.save_picture(self.picture)
 
     def save_edits(self) -> None:
         """Writes camera and edits to a file that does not exist yet."""
-        self.view.save_edits(_unused(self.layer))
+        self.view.save_edits(self.layer)
 
     # Texts
 
@@ -271,15 +271,6 @@ class Controls:
         names = {tuple("0123456789"): "0 ... 9", tuple(_DIRECTIONS): "arrows, PageUp/Down"}
         lines += [(names.get(action.keys, " ".join(action.keys)), action.help) for action in ACTIONS]
         return [f"{key:<20}{text}" for key, text in lines]
-
-
-def _unused(path: Path) -> Path:
-    """The path, or the first with a number added that is no file yet."""
-    candidate, number = path, 1
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.stem}_{number}{path.suffix}")
-    return candidate
 
 
 def _next(names: tuple[str, ...], name: str) -> str:

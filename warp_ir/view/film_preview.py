@@ -5,6 +5,7 @@ import time
 from typing import TYPE_CHECKING
 
 from warp_ir.scene import InputError
+from warp_ir.view.access import check_display
 from warp_ir.view.display import Pixels, display_pixels
 from warp_ir.view.terminal import TerminalPicture, terminal_picture
 
@@ -35,9 +36,9 @@ class FilmPreview:
         self._due = 0.0
         self._open = True
         try:
+            check_display()
             from warp_ir.view import window
 
-            window.check_display()
             self._window = window.PictureWindow(title, *_FIRST_SIZE)
         except InputError:
             self._terminal = terminal_picture(sys.stderr)

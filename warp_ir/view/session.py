@@ -312,24 +312,27 @@ class LiveView:
         return surface_at(scene, index, position[y, x].astype(np.float64))
 
     def save_picture(self, path: Path) -> None:
-        """Has the picture written as `render` would: radiance, or tone-mapped with the exposure of the view."""
+        """Has the picture written as `render` would: radiance, or tone-mapped with the exposure of the view.
+
+        It is written when it has the resolution of the window; where the file exists, a number is added to its name.
+        """
 
         def save() -> None:
-            film, state = self._film, self.state
-            if film is None:
-                raise InputError(f"{path}: there is no picture yet")
-            write_image(path, film, exposure=state.exposure, tonemap=state.tonemap)
-            self.say(f"{path}: {film.width} x {film.height}, {film.iterations} iterations")
+            film, state, file = self._film, self.state, _unused(path)
+            assert film is not None
+            write_image(file, film, exposure=state.exposure, tonemap=state.tonemap)
+            self.say(f"{file}: {film.width} x {film.height}, {film.iterations} iterations")
 
         self._put(save)
 
     def save_edits(self, path: Path) -> None:
-        """Has camera, lights and colours written as a layer for `render --session-layer`."""
+        """Has camera, lights and colours written as a layer for `render --session-layer`, under a name that is free."""
+        state = self.state
 
         def save() -> None:
-            state = self.state
-            left_out = self.source.save_edits(path, state.time, state.camera, state.edits)
-            self.say(f"{path}: for --session-layer{''.join(f'; {line}' for line in left_out)}")
+            file = _unused(path)
+            left_out = self.source.save_edits(file, state.time, state.camera, state.edits)
+            self.say(f"{file}: for --session-layer{''.join(f'; {line}' for line in left_out)}")
 
         self._put(save)
 
@@ -367,7 +370,7 @@ class LiveView:
 
     def step(self) -> Frame | None:
         """Does one piece of work; None if it has made no frame."""
-        while self._jobs and self._film is not None:
+        while self._jobs and self._film is not None and self._divisor <= 1.0:
             try:
                 self._jobs.popleft()()
             except InputError as error:
@@ -599,6 +602,15 @@ class LiveView:
             with self._lock:
                 self._cancellable = False
                 self._renderer.launcher.resume()
+
+
+def _unused(path: Path) -> Path:
+    """The path, or the first with a number added that is no file yet."""
+    candidate, number = path, 1
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.stem}_{number}{path.suffix}")
+    return candidate
 
 
 def _same(one: ViewState, other: ViewState | None, names: tuple[str, ...]) -> bool:

@@ -332,10 +332,6 @@ def serve_view(
     """Serves a view to browsers until it is closed; `say` is told the address.
 
     Raises:
-        InputError: The extra `view` is not installed, or the address cannot be used.
+        InputError: The extra `view` is not installed.
     """
-    server = ViewServer(view, controls, title)
-    try:
-        asyncio.run(server.serve(host, port, say))
-    except OSError as error:
-        raise InputError(f"--web: {host}:{port} cannot be used: {error.strerror or error}") from None
+    asyncio.run(ViewServer(view, controls, title).serve(host, port, say))

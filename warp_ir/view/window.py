@@ -2,8 +2,6 @@
 
 import ctypes
 import ctypes.util
-import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from warp_ir.scene import InputError
+from warp_ir.view.access import NO_DISPLAY
 from warp_ir.view.controls import Controls
 from warp_ir.view.display import Pixels
 from warp_ir.view.session import Frame, LiveView
@@ -22,7 +21,6 @@ _WINDOWS = ("vtkXOpenGLRenderWindow", "vtkWin32OpenGLRenderWindow", "vtkCocoaRen
 """Classes of windows on a screen: without one VTK makes others, which nobody sees."""
 _KEYS = {"Prior": "PageUp", "Next": "PageDown", "plus": "+", "minus": "-", "KP_Add": "+", "KP_Subtract": "-"}
 """Our names of keys for those of X11."""
-_NO_DISPLAY = "no display to open a window on; --web shows it in a browser"
 _FONT_SIZE = 12
 _BUTTONS = ("Left", "Middle", "Right")
 _TITLE_PIXELS = 12
@@ -65,7 +63,7 @@ class PictureWindow:
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # our own message says it
         self.window: Any = vtkRenderWindow()
         if self.window.GetClassName() not in _WINDOWS:
-            raise InputError(_NO_DISPLAY)
+            raise InputError(NO_DISPLAY)
         self.window.SetWindowName(title)
         self.window.SetSize(width, height)
         self.renderer: Any = vtkRenderer()
@@ -184,7 +182,6 @@ class ViewWindow:
         interactor.AddObserver("KeyPressEvent", lambda *_: self._key(True))
         interactor.AddObserver("KeyReleaseEvent", lambda *_: self._key(False))
         interactor.AddObserver("LeaveEvent", lambda *_: controls.forget_keys())
-        self._add_sliders()
 
     def run(self, on_frame: Callable[["ViewWindow"], None] | None = None) -> None:
         """Shows the view until its window is closed.
@@ -331,6 +328,8 @@ class ViewWindow:
     def _update_sliders(self) -> None:
         """Shows the sliders that are wanted, at the values of the view; those of a colour once a surface is picked."""
         state, controls = self.view.state, self.controls
+        if not self._sliders and (controls.show_panel or controls.surface):
+            self._add_sliders()
         edit, height = state.edits.light(controls.light), max(self.picture.size[1], _TITLE_PIXELS)
         values = [
             state.exposure,
@@ -338,7 +337,7 @@ class ViewWindow:
             float(np.log2(max(edit.gain, 1e-6))),
             *controls.color,
         ]
-        for k, (widget, value) in enumerate(zip(self._sliders, values, strict=True)):
+        for k, (widget, value) in enumerate(zip(self._sliders, values, strict=False)):
             wanted = bool(controls.surface) if k >= 3 else controls.show_panel
             if bool(widget.GetEnabled()) != wanted:
                 widget.SetEnabled(wanted)
@@ -355,16 +354,6 @@ def show_view(view: LiveView, controls: Controls, title: str) -> None:
         InputError: There is no display, or it is lost.
     """
     ViewWindow(view, controls, title).run()
-
-
-def check_display() -> None:
-    """Finds out cheaply whether a window may be opened: on Linux that needs an X server, as Wayland's sessions have.
-
-    Raises:
-        InputError: There is no display.
-    """
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise InputError(_NO_DISPLAY)
 
 
 def wait_for_frame(window: ViewWindow, seconds: float) -> bool:
