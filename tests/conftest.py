@@ -8,7 +8,10 @@ import warp as wp
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
-_LAUNCHING = {"Launcher", "Renderer", "device", "exec", "launcher", "main", "render", "trace_vpls", "upload_scene"}
+_LAUNCHING = {
+    *("Launcher", "LiveView", "Renderer", "device", "exec", "launcher", "main", "render", "trace_vpls", "upload_scene"),
+    "view_of",
+}
 """Fixtures and names by which most tests that launch kernels can be told; all of tests/physics do."""
 
 

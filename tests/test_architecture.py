@@ -33,6 +33,7 @@ LAYERS = [
     ["estimators", "interrupt"],
     ["renderer"],
     ["preview"],
+    ["view"],
     ["cli"],
     ["__main__"],
 ]
@@ -43,7 +44,7 @@ USD_LAYERS = [
     ["shading"],
     ["settings"],
     ["camera_prim", "diagnose", "linking", "time_varying", "vpl_layers"],
-    ["traverse"],
+    ["edit_layer", "traverse"],
     ["assemble"],
     ["load"],
     ["__init__"],

@@ -94,6 +94,21 @@ def test_iterations_of_another_scene_are_refused(device):
         renderer.add_iteration(film, 1)
 
 
+def test_other_settings_of_a_renderer_give_the_picture_of_a_new_one(device):
+    """`update` with settings: the same bits as a renderer that had them from the start; refused ones change nothing."""
+    scene = furnace(0.5, level=1)
+    small, large = (ir.RenderSettings(width=n, height=n, iterations=2, light_paths=64, filter=n > 8) for n in (8, 12))
+    renderer = Renderer(scene, small, device=device)
+    renderer.render()
+    renderer.update(scene, large)
+    expected = Renderer(scene, large, device=device).render().radiance()
+    assert (renderer.render().radiance() == expected).all()
+    renderer.launcher.memory = lambda: 1e6
+    with pytest.raises(ir.InputError, match="12345 x 12 pixels need"):
+        renderer.update(scene, replace(large, width=12345))
+    assert renderer.settings == renderer.wanted == large
+
+
 def test_threads_take_turns(device):
     """Films of one renderer that three threads fill at the same time have the bits of films filled alone."""
     renderer = Renderer(cornell_box(), ir.RenderSettings(width=24, light_paths=64, iterations=4), device=device)

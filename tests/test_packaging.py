@@ -41,7 +41,7 @@ def test_readme_render_command_parses():
     """The README's first command, and the others, are understood, and their scene exists."""
     from warp_ir.cli.arguments import parse
 
-    commands = re.findall(r"warp-ir ((?:render|info|vpls|compare) [^`#\n]+)", README)
+    commands = re.findall(r"warp-ir ((?:render|view|info|vpls|compare) [^`#\n]+)", README)
     assert len(commands) >= 8
     for command in commands:
         parse(command.split())

@@ -85,19 +85,28 @@ class Renderer:
             self._upload(scene)
             self.launcher.load(after)
 
-    def update(self, scene: Scene) -> None:
+    def update(self, scene: Scene, settings: RenderSettings | None = None) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.
 
-        Nothing can be added to films of the old scene afterwards.
+        Nothing can be added to films of the old scene or the old settings afterwards.
+
+        Args:
+            scene: What to render from now on; the present scene, to change the settings alone.
+            settings: How to render it; None: as before.
 
         Raises:
-            InputError: The scene cannot be used.
+            InputError: The scene or the settings cannot be used.
         """
         with self.launcher.exclusive:
             self.launcher.profile.clear()
             self._reported = {}, {}
-            self._take_settings(scene)
+            before = self._resolved
+            self._take_settings(scene, settings)
             with self.launcher.loading():
+                if self._resolved.estimator != before.estimator:
+                    self.launcher.load(ESTIMATORS[self._resolved.estimator].MODULES)
+                if self._resolved.filter and not before.filter:
+                    self.launcher.load(FILTER_MODULES)
                 self._upload(scene)
 
     @property
@@ -214,17 +223,22 @@ class Renderer:
             shutter = [(state.scene, state.camera) for state in self._shutter]
             return measure_coverage(shutter, numbers, self.settings.seed, self.launcher)
 
-    def _take_settings(self, scene: Scene) -> None:
-        """Fills in the settings that depend on the scene's camera, and refuses pictures too large for the memory."""
-        self._resolved = self.wanted.resolve(scene.camera.aspect, self._guiding)
-        self.settings = replace(self.wanted, height=self._resolved.height)
-        _, _, columns, rows = self.settings.pixels()
-        needed, available = columns * rows * pixel_bytes(scene, self._resolved), self.launcher.memory()
+    def _take_settings(self, scene: Scene, settings: RenderSettings | None = None) -> None:
+        """Fills in what depends on the scene's camera, and refuses pictures too large for the memory.
+
+        If it refuses, the settings stay as they were.
+        """
+        wanted = settings or self.wanted
+        resolved = wanted.resolve(scene.camera.aspect, self._guiding)
+        definite = replace(wanted, height=resolved.height)
+        _, _, columns, rows = definite.pixels()
+        needed, available = columns * rows * pixel_bytes(scene, resolved), self.launcher.memory()
         if needed > available:
             raise InputError(
                 f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
                 f" {self.launcher.device} has {available / 2**30:.0f}"
             )
+        self.wanted, self.settings, self._resolved = wanted, definite, resolved
 
     def _upload(self, scene: Scene) -> None:
         """Uploads every shutter sample of the scene, and allocates the buffers that an iteration fills in."""

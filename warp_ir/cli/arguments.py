@@ -28,6 +28,8 @@ _PICTURE_ONLY = {
     *("pixel_aspect", "conform", "data_window", "depth_of_field", "motion_blur", "color_space", "filter", "denoise"),
 }
 """Settings that affect the picture but not the light paths: `warp-ir vpls` has no flags for them."""
+_NOT_IN_VIEW = {"time_limit", "data_window", "pixel_aspect", "motion_blur", "color_space", "denoise"}
+"""Settings that a live view does not have."""
 VPL_DRAWING = ("view", "color_by", "bounces", "min_contribution", "paths", "order")
 """Flags of `warp-ir vpls` that only a drawing has; None if they are not given."""
 _SHORT = {"width": ("-w",)}
@@ -98,6 +100,21 @@ examples:
       --color-by contribution
   # lights with which any renderer can light the scene
   warp-ir vpls room.usda lights.usda --as-lights
+"""
+_VIEW_NOTES = """\
+Dragging orbits, or looks around inside of a room; the wheel moves closer, the
+keys w a s d walk, and F1 lists the others. The picture is coarse while it moves
+and refines while it rests. Files of the stage that change are read again.
+
+examples:
+  # look around in a room
+  warp-ir view room.usda
+  # a larger window, direct light only
+  warp-ir view room.usda --res 1280 720 --max-bounces 0
+  # in a browser on this machine; HOST:PORT also lets others in, by a token
+  warp-ir view room.usda --web 8080
+  # render what F3 has saved of camera, lights and colours
+  warp-ir render room.usda room.png --session-layer view_edits.usda
 """
 _COMPARE_NOTES = """\
 relMSE is the mean of (x - r)^2 / (r^2 + 0.01 m^2), where x is the picture, r
@@ -243,6 +260,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary, notes, fill in (
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
+        ("view", "show a stage in a window in which one moves around, and edit its lights", _VIEW_NOTES, _add_view),
         ("info", "show what a stage contains, what will be skipped, and why", "", _add_info),
         ("vpls", "write the virtual point lights as a picture, page, model, USD or arrays", _VPLS_NOTES, _add_vpls),
         ("compare", "measure error against time of each method and recommend one", _COMPARE_NOTES, _add_compare),
@@ -370,12 +388,35 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     mattes = f"Cryptomattes in .exr, by {' or '.join(KINDS)}: coverage counted by 64 more camera rays per pixel"
     output.add_argument("--cryptomatte", type=_names(KINDS), default=[], metavar="NAME[,NAME]", help=mattes)
     output.add_argument("--owner", metavar="TEXT", help="whose picture it is, written to .exr")
+    preview = "show the picture while it is rendered, in a window, or in a terminal that can"
+    output.add_argument("--preview", action="store_true", help=preview)
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
     resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)
     checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
+    _add_device(output)
+    threads = "CPU threads (default: one for each core); the picture does not depend on it"
+    output.add_argument("--threads", type=_count, metavar="N", help=threads)
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    picture = parser.add_argument_group("picture")
+    _add_settings(picture, [name for name in _FIELDS if name not in _NOT_IN_VIEW])
+    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height together")
+    stops = "exposure: each stop doubles the radiance (default: 0, or more or less where that would show nothing)"
+    picture.add_argument("--exposure", type=_stops, metavar="STOPS", help=stops)
+    curve = "tone curve: srgb clips highlights, filmic compresses them smoothly (default: srgb)"
+    picture.add_argument("--tonemap", choices=TONEMAPS, default=TONEMAPS[0], help=curve)
+    _add_stage(parser, frames=False)
+    output = parser.add_argument_group("output")
+    web = "serve the view to a browser at this port, of 127.0.0.1 or of another address, which then needs a token"
+    output.add_argument("--web", type=_address, metavar="[HOST:]PORT", help=web)
+    saved = "file that F2 saves the picture to; a number is added where it exists (default: view.png)"
+    output.add_argument("--picture", default="view.png", metavar="FILE", help=saved)
+    layer = "file that F3 saves camera, lights and colours to (default: view_edits.usda)"
+    output.add_argument("--edits", default="view_edits.usda", metavar="FILE", help=layer)
     _add_device(output)
     threads = "CPU threads (default: one for each core); the picture does not depend on it"
     output.add_argument("--threads", type=_count, metavar="N", help=threads)
@@ -596,6 +637,13 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text[:9]) <= 1000:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, is {text!r}")
     return int(text)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not port.isdecimal() or int(port[:6]) > 65535 or (colon and not host):
+        raise argparse.ArgumentTypeError(f"must be a port such as 8080, or HOST:PORT, is {text!r}")
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 def _whole_numbers(text: str) -> list[int]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint
-from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
+from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from warp_ir.scheduling import Progress
     from warp_ir.usd import StageReader
     from warp_ir.usd.settings.render_spec import Product
+    from warp_ir.view.film_preview import FilmPreview
 
 _EXPLANATIONS = ("all geometry", "draws no geometry", "it emits nothing", "the picture is black")
 """Words of the warnings of a scene that explain a black picture."""
@@ -64,6 +65,7 @@ class _Job:
     reader: "StageReader"
     view: tuple[str, str] | None
     """OpenColorIO's display and view; None: pictures are tone-mapped."""
+    preview: "FilmPreview | None" = None
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
     write_seconds: float | None = None
@@ -92,10 +94,15 @@ def run(args: argparse.Namespace) -> int:
         _ = ir.load_usd, ir.Renderer  # imported here, so that the first frame's time does not include it
     versions = _versions()
     imported = time.perf_counter() - args.started
+    preview = None
+    if args.preview:
+        from warp_ir.view.film_preview import FilmPreview
+
+        preview = FilmPreview(f"{args.stage} - warp-ir", args.exposure, args.tonemap or TONEMAPS[0])
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader, view)
+    job = _Job(args, device, versions, reader, view, preview)
     if into_folder:
         pictures = _products(job)
 
@@ -115,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
         frames.append(statistics)
         if code:
             break
+    if preview is not None:
+        preview.close()
     if args.stats:
         _write_stats(Path(args.stats), job, imported, frames)
     return code
@@ -197,7 +206,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code."""
     args = job.args
     path = next(iter(picture.files))
-    with ProgressDisplay(label, quiet=args.quiet) as display:
+    preview = job.preview
+    in_terminal = preview is not None and preview.in_terminal
+    with ProgressDisplay(label, quiet=args.quiet or in_terminal) as display:
         begin = time.perf_counter()
         scene = job.reader.read(picture.time, picture.product)
         load_seconds = time.perf_counter() - begin
@@ -220,6 +231,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
 
         def report(progress: "Progress") -> None:
             display(progress)
+            if preview is not None:
+                preview(film, f"{label}: {describe_progress(progress)}")
             if progress.fraction < 1.0:
                 checkpoint.write_if_due()
 
@@ -228,6 +241,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
         renderer.render(film, report, started=started, reserve=reserve)
         render_seconds = time.perf_counter() - begin
+        if preview is not None:
+            preview(film, label, last=True)
     timings = {**film.timings, "load": load_seconds, "render": render_seconds}
     # `Film.interrupted` is the number of the signal.
     stop_signal = int(film.interrupted)

@@ -37,7 +37,7 @@ def open_reader(args: argparse.Namespace) -> "StageReader":
         mask=args.mask,
         variants=args.variants,
         session_layer=args.session_layer,
-        motion_blur=getattr(args, "motion_blur", args.command != "vpls"),
+        motion_blur=getattr(args, "motion_blur", args.command not in ("vpls", "view")),
     )
 
 

@@ -3,6 +3,7 @@
 All functions work channel by channel on NumPy arrays of any shape, except those of luminance.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -74,14 +75,23 @@ def suggest_exposure(radiance: Array, exposure: float = 0.0) -> float | None:
         radiance: Linear, shape [..., 3].
         exposure: Exposure with which the picture is shown [stops].
     """
-    # Float64 and log2 prevent overflow of exposure and picture.
-    positive = luminance(np.asarray(radiance, dtype=np.float64))
-    positive = positive[positive > 0.0]
-    if positive.size == 0:
+    log_luminance = _log_luminance(radiance)
+    if log_luminance.size == 0:
         return None
-    log_luminance = np.log2(positive)
     shown = float(np.mean(srgb_from_linear(np.exp2(np.clip(log_luminance + exposure, -64.0, 64.0)))))
     if 0.04 < shown < 0.96:
         return None
     # Adding zero turns a negative zero into a positive one.
-    return round(2.0 * float(np.log2(_MIDDLE_GREY) - np.mean(log_luminance))) / 2.0 + 0.0
+    return round(2.0 * (math.log2(_MIDDLE_GREY) - float(np.mean(log_luminance)))) / 2.0 + 0.0
+
+
+def automatic_exposure(radiance: Array) -> float:
+    """The exposure [stops] that maps the log-average luminance [..., 3] to middle grey; 0 if the picture is black."""
+    log_luminance = _log_luminance(radiance)
+    return math.log2(_MIDDLE_GREY) - float(np.mean(log_luminance)) if log_luminance.size else 0.0
+
+
+def _log_luminance(radiance: Array) -> Array:
+    """Logarithms to the base 2 of the luminances that are positive, [n]; float64 prevents overflow."""
+    positive = luminance(np.asarray(radiance, dtype=np.float64))
+    return np.asarray(np.log2(positive[positive > 0.0]))

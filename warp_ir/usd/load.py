@@ -3,16 +3,16 @@
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from pxr import Tf, Usd, UsdLux
 
-from warp_ir.scene import InputError, Light, LightKind, Mesh, Scene
+from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Scene
 from warp_ir.usd.assemble import Geometry, ShapeCache, build_meshes
-from warp_ir.usd.camera_prim import eye_camera, find_camera, framing_camera, read_camera, read_shutter
+from warp_ir.usd.camera_prim import all_cameras, eye_camera, find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.diagnose import diagnose_black_picture, diagnose_dark_lights
 from warp_ir.usd.geometry.prototypes import reuse_prototypes
 from warp_ir.usd.images.cache import ImageCache
@@ -20,7 +20,7 @@ from warp_ir.usd.lights.light import LIGHTS, read_light
 from warp_ir.usd.linking import LightLinks, link_lights
 from warp_ir.usd.settings.render_pass import find_render_pass
 from warp_ir.usd.settings.render_spec import Product, RenderSpec, read_render_spec
-from warp_ir.usd.stage.open import first_message, open_stage, quiet_diagnostics, time_code, up_axis
+from warp_ir.usd.stage.open import first_message, layer_files, open_stage, quiet_diagnostics, time_code, up_axis
 from warp_ir.usd.time_varying import TimeVarying
 from warp_ir.usd.traverse import DrawnPrim, DrawnPrims, traverse_stage
 from warp_ir.usd.values.report import Report, Unreadable
@@ -178,6 +178,7 @@ class StageReader:
         if (eye is not None and camera is not None) or (look_at is not None and eye is None):
             raise InputError("eye: it replaces camera, and look_at needs it")
         self._camera, self._purposes, self._default_light = camera, purposes, default_light
+        self._session_layers = () if session_layer is None else (os.fspath(session_layer),)
         self._eye, self._look_at = eye, look_at
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _REFINEMENT_LEVELS[complexity]
@@ -264,6 +265,38 @@ class StageReader:
     def moving_meshes(self) -> int:
         """Number of gprims of the last `read` that may differ at another time."""
         return 0 if self._static is None else len(self._static.moving.gprims)
+
+    @property
+    def up_axis(self) -> str:
+        """Y or Z."""
+        return self._up_axis
+
+    @property
+    def frames(self) -> tuple[float, float] | None:
+        """First and last time code of the stage; None: it names none."""
+        with self._reading():
+            if not self.stage.HasAuthoredTimeCodeRange():
+                return None
+            return float(self.stage.GetStartTimeCode()), float(self.stage.GetEndTimeCode())
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of the layers that the stage is composed of."""
+        with self._reading():
+            return layer_files(self.stage, self.source, *self._session_layers)
+
+    def cameras(self, time: float | str | None = None) -> tuple[Camera, ...]:
+        """All cameras of the stage that can be used, in the stage's order.
+
+        Args:
+            time: Time code, as for `load_usd`.
+        """
+        cameras, discarded = [], Report(self.source)
+        with self._reading():
+            for prim in all_cameras(self.stage):
+                with suppress(InputError):
+                    cameras.append(read_camera(prim, time_code(self.stage, time), discarded))
+        return tuple(cameras)
 
     def _shutter_scenes(
         self, time: float, interval: tuple[float, float], camera: Usd.Prim, spec: RenderSpec, report: Report

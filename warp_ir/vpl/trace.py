@@ -11,7 +11,7 @@ from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import DeviceScene, upload_scene
 from warp_ir.sampling.sobol import iteration_scramble
 from warp_ir.scene import Scene
-from warp_ir.settings import RenderSettings
+from warp_ir.settings import RenderSettings, ResolvedSettings
 from warp_ir.vpl.contribution import SeenSurface, contributions
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
@@ -107,20 +107,26 @@ def trace_vpls(
     resolved = settings.resolve(scene.camera.aspect)
     launcher = Launcher(device)
     uploaded = upload_scene(scene, launcher)
-    scratch = Scratch(launcher)
-    buffer = emit_vpls(
-        unguided(uploaded, launcher),
-        scratch,
-        light_paths=resolved.light_paths,
-        absorption=resolved.absorption,
-        max_bounces=resolved.max_bounces,
-        scramble=iteration_scramble(resolved.seed, iteration),
-    )
-    paths = resolved.light_paths if buffer.on_lights else 0
-    lengths = scratch.array("lengths", paths, wp.int32).numpy()[:paths]
-    vpls = to_host(buffer, uploaded, lengths)
+    buffer, vpls = trace_uploaded(uploaded, Scratch(launcher), resolved, iteration)
     if contribution_to is None:
         return vpls
     seen = SeenSurface.of(scene, uploaded, launcher, replace(settings, height=resolved.height), contribution_to)
     position = None if contribution_to == "picture" else seen.position
     return replace(vpls, contribution=contributions(uploaded, launcher, buffer, seen), pixel_position=position)
+
+
+def trace_uploaded(
+    scene: DeviceScene, scratch: Scratch, settings: ResolvedSettings, iteration: int = 0
+) -> tuple[VplBuffer, Vpls]:
+    """The VPLs of one iteration, without guiding, of a scene on the device: there, in `scratch`, and on the host."""
+    buffer = emit_vpls(
+        unguided(scene, scratch.launcher),
+        scratch,
+        light_paths=settings.light_paths,
+        absorption=settings.absorption,
+        max_bounces=settings.max_bounces,
+        scramble=iteration_scramble(settings.seed, iteration),
+    )
+    paths = settings.light_paths if buffer.on_lights else 0
+    lengths = scratch.array("lengths", paths, wp.int32).numpy()[:paths]
+    return buffer, to_host(buffer, scene, lengths)

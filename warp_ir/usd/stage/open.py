@@ -1,5 +1,6 @@
 """Opens a stage: errors become one line, and USD's diagnostics are collected."""
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -76,6 +77,32 @@ def open_stage(
         raise _open_error(path, error) from None
     _report_composition_errors(stage, report)
     return stage
+
+
+def layer_files(stage: Usd.Stage, *further: str) -> tuple[str, ...]:
+    """The files of a stage's layers, and further ones, as absolute paths in order; a package is one file."""
+    paths = [*further, *(layer.realPath for layer in stage.GetUsedLayers() if layer)]
+    return tuple(sorted({os.path.realpath(path.partition("[")[0]) for path in paths if path}))
+
+
+def reload_layers(paths: Sequence[str]) -> None:
+    """Reads files again whose layers are open: USD keeps the content of a layer as long as a stage uses it.
+
+    Raises:
+        InputError: A file is missing or is not readable as USD; its layer keeps the content that it had.
+    """
+    with quiet_diagnostics():
+        for layer in Sdf.Layer.GetLoadedLayers():
+            path = os.path.realpath(layer.realPath.partition("[")[0]) if layer.realPath else ""
+            if path not in paths:
+                continue
+            check_input(path, "a USD file")
+            try:
+                validate_crate(path)
+                if not layer.Reload():
+                    raise InputError(f"{path}: cannot be opened as USD: it contains no layer")
+            except (Tf.ErrorException, RuntimeError, OSError) as error:
+                raise _open_error(path, error) from None
 
 
 def _report_composition_errors(stage: Usd.Stage, report: Report) -> None:
