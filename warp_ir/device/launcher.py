@@ -84,6 +84,10 @@ class Launcher:
         self.profile = Profile(self.device)
         self.synchronous = self.device.is_cpu
         """Whether a launch has finished when the call returns: then the host reads results without waiting."""
+        self.lanes = self.device.is_cpu
+        """Whether a thread computes in vector registers: then it evaluates sixteen VPLs at once."""
+        self.wavefront = not self.lanes
+        """Whether gathering is a sequence of kernels, one for each step, in which neighbouring threads do the same."""
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.exclusive = threading.RLock()

@@ -19,6 +19,7 @@ from typing import ClassVar
 
 import warp as wp
 
+import warp_ir.estimators.wavefront
 import warp_ir.gbuffer
 import warp_ir.guiding.probes
 import warp_ir.vpl.emission
@@ -26,13 +27,20 @@ import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
+from warp_ir.estimators.wavefront import (
+    GatherSettings,
+    Wave,
+    compensate,
+    continuing_paths,
+    gather_in_waves,
+    sample_index,
+    wave_pixel,
+)
 from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
 from warp_ir.guiding import learn
-from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
-from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
-from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin
+from warp_ir.surface import albedo, shading_point
 from warp_ir.tiles import indices
 from warp_ir.vpl.emission import emit_vpls
 from warp_ir.vpl.gather import gather
@@ -49,18 +57,6 @@ _ROULETTE_DEPTH = wp.constant(2)
 _GATHER_STREAM = 0x5BD1E995  # decorrelates gathering from the light paths
 
 
-@wp.struct
-class GatherSettings:
-    """Parameters of the gathering kernel."""
-
-    first_column: int  # of the film in the image, as in `CameraData`
-    first_row: int
-    scramble: wp.uint32
-    rays: wp.vec2i  # shadow rays to VPLs on lights and on surfaces
-    compensation_rays: wp.vec2i  # shadow rays at the end of a compensation ray
-    max_bounces: int
-
-
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _gather_pixels(
     first: int,
@@ -68,65 +64,62 @@ def _gather_pixels(
     gbuffer: GBuffer,
     vpl_sets: wp.array[VplSets],
     settings: GatherSettings,
+    wave: Wave,
 ) -> None:
-    """Computes the irradiance over π, direct and indirect, of one pixel."""
-    pixel = reflecting_pixel(gbuffer, first + wp.tid())
+    """Computes the irradiance over π, direct and indirect, of one pixel; or of one whose path continues in a wave.
+
+    There the light at the camera vertex has been gathered already.
+    """
+    i = first + wp.tid()
+    pixel = int(-1)
+    if wave.size == 0:
+        pixel = reflecting_pixel(gbuffer, i)
+    elif i < continuing_paths(wave):
+        i = wave.paths[i]
+        pixel = wave_pixel(gbuffer, wave, i)
     if pixel < 0:
         return
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    # The index depends on the pixel's place in the image, not on the film: a crop has the same pixels.
-    column = settings.first_column + pixel % gbuffer.tiles.columns
-    row = settings.first_row + pixel // gbuffer.tiles.columns
-    index = sobol.index_of_pixel(column, row, settings.scramble)
+    index = sample_index(settings, gbuffer, pixel)
     # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
     u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
     x = camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
-    radius = 1.0 / wp.sqrt(bound.minimum)  # length of compensation rays: farther away G cannot exceed the bound
     depth = int(0)
     rays = settings.rays
     while depth <= settings.max_bounces:
-        u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
-        bounces = settings.max_bounces - depth
-        from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
-        from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
-        if depth == 0:
-            direct = from_lights
-            indirect = from_surfaces
+        if depth == 0 and wave.size > 0:
+            direct = wave.irradiance[i]
+            indirect = wave.irradiance[wave.size + i]
         else:
-            indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
+            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
+            bounces = settings.max_bounces - depth
+            from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
+            from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
+            if depth == 0:
+                direct = from_lights
+                indirect = from_surfaces
+            else:
+                indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
 
         v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
-        direction = square_to_cosine_hemisphere(v, x.shading_normal)
-        if wp.dot(direction, x.normal) <= 0.0:
-            break
-        cosine = wp.dot(direction, x.shading_normal)
-        origin = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
-        hit = closest(scene, origin, direction, radius)
-        t_max = wp.where(hit.triangle < 0, radius, hit.t)
-        emitted = clamped_light_radiance(scene, x, direction, t_max, cosine, bound, radius)
-        clamped = float(0.0)
-        if hit.triangle >= 0:
-            g = geometry_term_of_hit(x, direction, hit)
-            clamped = clamped_fraction(bound.minimum, g[0]) * g[1]
-            if clamped > 0.0:
-                emitted += clamped_surface_radiance(scene, hit, direction, g[0], bound, x.mesh) * g[1]
-        emitted = wp.cw_mul(throughput, emitted) * wp.pi
+        compensation = compensate(scene, x, v, bound)
+        emitted = wp.cw_mul(throughput, compensation.emitted) * wp.pi
         if depth == 0:
             direct += emitted
         else:
             indirect += emitted
-        if clamped <= 0.0:
+        if compensation.clamped <= 0.0:
             break
-        throughput = wp.cw_mul(throughput, albedo(scene, hit, scene.footprint)) * clamped
+        throughput = wp.cw_mul(throughput, albedo(scene, compensation.hit, scene.footprint)) * compensation.clamped
         if depth > _ROULETTE_DEPTH:
             survival = wp.min(wp.max(throughput), 0.99)
             if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
                 break
             throughput = throughput / survival
-        x = shading_point(scene, hit)
+        x = shading_point(scene, compensation.hit)
         rays = settings.compensation_rays
         depth += 1
     gbuffer.normal_or_direct[pixel] = direct / wp.pi
@@ -147,8 +140,10 @@ class VplEstimator:
         """The guide, once it has been learned."""
         guiding = settings.guiding
         self._first_guided = math.inf if guiding is None or not scene.emits else guiding.first_iteration
+        if self._launcher.wavefront:
+            self._launcher.load([warp_ir.estimators.wavefront])
         if settings.iteration_limit > self._first_guided:
-            scratch.launcher.load([warp_ir.guiding.probes])
+            self._launcher.load([warp_ir.guiding.probes])
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
@@ -175,11 +170,11 @@ class VplEstimator:
         gathering.rays, gathering.compensation_rays = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_COMPENSATION_SHADOW_RAYS)
         gathering.max_bounces = settings.max_bounces
         with launcher.phase("gather"):
-            launcher.launch(
-                _gather_pixels,
-                indices(gbuffer.tiles),
-                [guide.scene.data, gbuffer, vpl_sets, gathering],
-            )
+            inputs = [guide.scene.data, gbuffer, vpl_sets, gathering]
+            if launcher.wavefront:
+                gather_in_waves(_gather_pixels, inputs, self._scratch)
+            else:
+                launcher.launch(_gather_pixels, indices(gbuffer.tiles), [*inputs, Wave()])
 
     def _guide_of(self, iteration: int) -> Guide:
         """The guide of an iteration's light paths; it is learned when it is first needed."""
