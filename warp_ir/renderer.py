@@ -201,7 +201,7 @@ class Renderer:
 
     def _take_settings(self, scene: Scene) -> None:
         """Fills in the settings that depend on the scene's camera, and refuses pictures too large for the memory."""
-        self._resolved = self.wanted.resolve(scene.camera.aspect, self._guiding)
+        self._resolved = self.wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
         self.settings = replace(self.wanted, height=self._resolved.height)
         _, _, columns, rows = self.settings.pixels()
         needed, available = columns * rows * pixel_bytes(scene, self._resolved), self.launcher.memory()

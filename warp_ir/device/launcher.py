@@ -29,11 +29,16 @@ _MAX_BANDS_PER_THREAD = 64
 _MIN_BAND_SECONDS = 1.0e-4
 """Least duration of a band [s]: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
+_MAX_LIGHT_PATHS = 4096
+"""Largest default number of light paths on a CPU, where more take longer."""
+_REGISTERS_PER_SM = 65536
 MAX_REGISTERS = 168
 """Registers of a CUDA thread in kernels that trace rays. Without a limit the compiler takes 255, and a multiprocessor
 holds 256 threads; with this limit it holds 384, which hide each other's latencies better. What does not fit is spilled
 to local memory, mostly by callers during traversal. The number is that of Blender's Cycles
 (kernel/device/cuda/config.h); it has not been measured here yet."""
+_THREADS_PER_SM = _REGISTERS_PER_SM // MAX_REGISTERS // 32 * 32
+"""Threads of kernels that trace rays that a multiprocessor holds."""
 
 
 Record = TypeVar("Record")
@@ -306,6 +311,15 @@ class Launcher:
             return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         except (AttributeError, OSError, ValueError):
             return math.inf
+
+    def max_light_paths(self) -> int:
+        """Largest default number of light paths, a power of two.
+
+        On a GPU it is what the device runs at once: fewer would leave a part of it idle, and take as long, because a
+        light path is traced one vertex after the other.
+        """
+        threads = self.device.sm_count * _THREADS_PER_SM
+        return max(_MAX_LIGHT_PATHS, 1 << max(threads.bit_length() - 1, 0))
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""

@@ -72,7 +72,7 @@ class Wave:
 
 @wp.func
 def sample_index(settings: GatherSettings, gbuffer: GBuffer, pixel: int) -> int:
-    """The index of the point of the sequence that a pixel uses, by its place in the image: a crop has the same pixels."""
+    """The index of a pixel's point of the sequence, by its place in the image: a crop has the same pixels."""
     column = settings.first_column + pixel % gbuffer.tiles.columns
     row = settings.first_row + pixel // gbuffer.tiles.columns
     return sobol.index_of_pixel(column, row, settings.scramble)

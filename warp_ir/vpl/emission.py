@@ -93,6 +93,7 @@ class LightPathSettings:
     survivors: wp.array[wp.int32]  # [levels], number of paths that are reflected j times
     levels: int
     recorded: int  # VPLs of a path that are recorded while it is traced
+    again: int  # 1: this launch follows the paths again that have more
     capacity: int  # for VPLs on surfaces; if there are more, an even selection of them stands for all
     photon_target: PhotonTarget
     importance: ViewImportance
@@ -300,14 +301,35 @@ def _trace_light_path(
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_light_paths(
-    first: int, scene: SceneData, settings: LightPathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
+    first: int,
+    scene: SceneData,
+    settings: LightPathSettings,
+    lengths: wp.array[wp.int32],
+    ends: wp.array[wp.int32],
+    vpls: VplBuffer,
 ) -> None:
     """Traces light path `i`, and records its point on the light and its first VPLs on surfaces.
 
-    Row `on_lights + k paths + i` of `traced` is the path's k-th VPL on a surface.
+    Row `on_lights + k paths + i` of `vpls` is then the path's k-th VPL on a surface. When paths are followed again,
+    those that have more VPLs store them after those of the paths before them, which `ends` counts.
     """
     i = first + wp.tid()
-    lengths[i] = _trace_light_path(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.recorded)
+    number = i
+    stride = settings.paths
+    total = int(0)
+    skip = int(0)
+    end = settings.recorded
+    if settings.again == 1:
+        if lengths[i] <= settings.recorded:
+            return
+        number = ends[i] - lengths[i]
+        stride = 1
+        total = ends[settings.paths - 1]
+        skip = settings.recorded
+        end = lengths[i]
+    length = _trace_light_path(scene.address, settings, i, vpls, number, stride, total, skip, end)
+    if settings.again == 0:
+        lengths[i] = length
 
 
 @wp.func
@@ -320,7 +342,7 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
         target.lift[to] = source.lift[row]
 
 
-@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+@wp.kernel
 def _store_light_paths(
     first: int,
     scene: SceneData,
@@ -331,7 +353,7 @@ def _store_light_paths(
     vpls: VplBuffer,
     counted: wp.array[wp.int64],
 ) -> None:
-    """Stores light path `i`: its point on the light in row i, its other VPLs after those of the paths before it."""
+    """Stores what is recorded of light path `i`: its point on the light in row i, VPLs after those of earlier paths."""
     i = first + wp.tid()
     total = ends[settings.paths - 1]
     number = ends[i] - lengths[i]
@@ -344,8 +366,6 @@ def _store_light_paths(
         vpls.pdf_area[i] = traced.pdf_area[i]
         if scene.modifier_count > 0:
             vpls.modifiers[i] = traced.modifiers[i]
-    if lengths[i] > settings.recorded:
-        _trace_light_path(scene.address, settings, i, vpls, number, 1, total, settings.recorded, lengths[i])
     if i == settings.paths - 1:
         vpls.count[0] = settings.on_lights + wp.min(total, settings.capacity)
         counted[0] += wp.int64(vpls.count[0])
@@ -402,14 +422,17 @@ def emit_vpls(
     settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
     # Two passes: paths are stored when the lengths of all are known. So every path has its rows without atomics, and no
-    # path has a maximal length; the few that are longer than what was recorded of them are traced again.
+    # path has a maximal length; the few that are longer than what was recorded of them are followed again.
     lengths, ends = scratch.array("lengths", paths, wp.int32), scratch.array("ends", paths, wp.int32)
     traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
-    launcher.launch(_trace_light_paths, paths, [scene.data, settings, traced, lengths])
+    launcher.launch(_trace_light_paths, paths, [scene.data, settings, lengths, ends, traced])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
     vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.row_count(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
     launcher.launch(_store_light_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
+    if settings.recorded < max_bounces:
+        settings.again = 1
+        launcher.launch(_trace_light_paths, paths, [scene.data, settings, lengths, ends, vpls])
     launcher.profile.counts["light_paths"] += paths
     return vpls
 
@@ -445,7 +468,8 @@ def trace_light_vertices(
     settings.recorded, settings.capacity = max_vertices, paths * max_vertices
     vertices = _buffer(guide.scene, scratch, "vertices", paths, settings.capacity)
     lengths = scratch.array("vertices.lengths", paths, wp.int32)
-    scratch.launcher.launch(_trace_light_paths, paths, [guide.scene.data, settings, vertices, lengths])
+    inputs = [guide.scene.data, settings, lengths, lengths, vertices]
+    scratch.launcher.launch(_trace_light_paths, paths, inputs)
     return vertices, lengths
 
 
