@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import warp as wp
 
 import warp_ir.bvh.build
+from warp_ir.device.graph import RepeatedLaunches
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_scenes
@@ -147,10 +148,16 @@ class Renderer:
             self._gbuffer.tiles = film.tiles
             number = stratum(iteration, len(self._shutter).bit_length() - 1)
             state = self._shutter[number]
-            state.estimator.estimate(iteration, self._gbuffer)
-            # An iteration is added whole or not at all.
-            with self.launcher.phase("film"), self.launcher.uninterruptible():
-                film.add(self._gbuffer, state.exposure, number)
+
+            def launches() -> None:
+                state.estimator.estimate(iteration, self._gbuffer)
+                # An iteration is added whole or not at all.
+                with self.launcher.phase("film"), self.launcher.uninterruptible():
+                    film.accumulate(self._gbuffer, state.exposure, number)
+
+            prepared = state.estimator.prepare(iteration)
+            state.launches.run((film, film.tiles, self._block, prepared), launches)
+            film.count_iteration()
             wp.synchronize_device(self.launcher.device)
 
     def render(
@@ -223,7 +230,8 @@ class Renderer:
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
             estimator = ESTIMATORS[settings.estimator](device_scene, camera, settings, self._scratch)
-            self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure))
+            launches = RepeatedLaunches(self._scratch)
+            self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure, launches))
         if camera.blurs and settings.filter:
             launcher.load(BLUR_MODULES)
         layout = _BufferLayout(
@@ -272,6 +280,7 @@ class Renderer:
             film.counts[what] = film.counts.get(what, 0) + counts[what] - self._reported[1].get(what, 0)
         film.counts["iterations"] = film.iterations
         film.counts["skipped_samples"] = film.skipped
+        film.counts.setdefault("graph_launches", 0)
         self._reported = seconds, counts
 
 
@@ -283,6 +292,7 @@ class _ShutterState:
     camera: CameraData
     estimator: Estimator
     exposure: float
+    launches: RepeatedLaunches
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -93,6 +93,9 @@ class Launcher:
         """Whether a thread computes in vector registers: then it evaluates sixteen VPLs at once."""
         self.wavefront = not self.lanes
         """Whether gathering is a sequence of kernels, one for each step, in which neighbouring threads do the same."""
+        self.graphs = self.device.is_cuda and wp.is_mempool_enabled(self.device)
+        """Whether launches that are repeated are recorded as a graph; sorting in a graph takes a memory pool."""
+        self._recording = False
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.exclusive = threading.RLock()
@@ -158,7 +161,7 @@ class Launcher:
         if count <= 0:
             return
         self._wait_for(kernel.module)
-        if self.device.is_cuda:
+        if self.device.is_cuda or self._recording:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
         launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)
@@ -188,7 +191,7 @@ class Launcher:
         The launches must not depend on each other, nor on the block, nor the block on them. On CUDA they run first.
         Their time is added to `phase`, and not to the phases inside the block.
         """
-        if self.device.is_cuda:
+        if self.device.is_cuda or self._recording:
             with self.phase(phase):
                 start()
             yield
@@ -296,12 +299,40 @@ class Launcher:
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Adds the time of the launches inside to the phase `name`."""
+        if self._recording:
+            yield
+            return
         outer, self._phase = self._phase, name
         try:
             with self.profile.phase(name):
                 yield
         finally:
             self._phase = outer
+
+    def record(self, launches: Callable[[], None]) -> Any:
+        """Records what `launches` launches, sorts and scans, as a graph; nothing of it runs.
+
+        All that it needs must be there already: it may neither allocate nor upload nor read.
+        """
+        self._recording = True
+        try:
+            with wp.ScopedCapture(device=self.device) as capture:
+                launches()
+        finally:
+            self._recording = False
+        return capture.graph
+
+    def replay(self, graph: Any, shares: Mapping[str, float]) -> None:
+        """Runs what was recorded. Its time is divided among phases by their `shares`.
+
+        Raises:
+            Cancelled: `cancel` was called before it began.
+        """
+        if self._cancelled.is_set():
+            raise Cancelled
+        with self.profile.phases(shares):
+            wp.capture_launch(graph)
+        self.profile.counts["graph_launches"] += 1
 
     def memory(self) -> float:
         """Bytes that may be allocated: the free memory of a GPU, the whole memory of a CPU; infinity if unknown."""

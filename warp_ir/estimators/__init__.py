@@ -27,6 +27,12 @@ class Estimator(Protocol):
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a camera and settings; what an iteration overwrites lies in `scratch`."""
 
+    def prepare(self, iteration: int) -> object:
+        """Does what of an iteration no graph can repeat: it uploads numbers, and learns a guide where that is due.
+
+        `estimate` calls it as well. While the result is the same object, `estimate` makes the same launches.
+        """
+
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
 

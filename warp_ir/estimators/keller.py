@@ -77,11 +77,18 @@ class Keller:
         radius = settings.bound_radius * scene.extent
         self._bound = 1.0 / radius**2 if radius > 0.0 else UNBOUNDED
 
+    def prepare(self, iteration: int) -> object:
+        """Uploads the numbers of an iteration."""
+        self._scratch.number("scramble", iteration_scramble(self._settings.seed, iteration), wp.uint32)
+        self._iteration = self._scratch.number("iteration", iteration, wp.int32)
+        return self._unguided
+
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
+        self.prepare(iteration)
         with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
         with launcher.phase("emission"):
             vpls = emit_vpls(
                 self._unguided,

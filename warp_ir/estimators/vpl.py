@@ -33,6 +33,7 @@ from warp_ir.estimators.wavefront import (
     compensate,
     continuing_paths,
     gather_in_waves,
+    gather_scramble,
     sample_index,
     wave_pixel,
 )
@@ -54,7 +55,6 @@ _SHADOW_RAYS = (4, 4)
 _COMPENSATION_SHADOW_RAYS = (2, 2)
 """Shadow rays at the end of a compensation ray, whose light has lost most of its weight."""
 _ROULETTE_DEPTH = wp.constant(2)
-_GATHER_STREAM = 0x5BD1E995  # decorrelates gathering from the light paths
 
 
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
@@ -82,8 +82,9 @@ def _gather_pixels(
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
     index = sample_index(settings, gbuffer, pixel)
+    scramble = gather_scramble(settings)
     # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
-    u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
+    u_set = sobol.sample_1d(scene.sobol, index, 0, scramble)
     x = camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
@@ -94,7 +95,7 @@ def _gather_pixels(
             direct = wave.irradiance[i]
             indirect = wave.irradiance[wave.size + i]
         else:
-            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
+            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, scramble)
             bounces = settings.max_bounces - depth
             from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
             from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
@@ -104,7 +105,7 @@ def _gather_pixels(
             else:
                 indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
 
-        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
+        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, scramble)
         compensation = compensate(scene, x, v, bound)
         emitted = wp.cw_mul(throughput, compensation.emitted) * wp.pi
         if depth == 0:
@@ -145,15 +146,21 @@ class VplEstimator:
         if settings.iteration_limit > self._first_guided:
             self._launcher.load([warp_ir.guiding.probes])
 
+    def prepare(self, iteration: int) -> Guide:
+        """Uploads the numbers of an iteration, and learns the guide when it is first needed: the result."""
+        scramble = sobol.iteration_scramble(self._settings.seed, iteration)
+        self._scramble = self._scratch.number("scramble", scramble, wp.uint32)
+        self._iteration = self._scratch.number("iteration", iteration, wp.int32)
+        return self._guide_of(iteration)
+
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
-        scramble = sobol.iteration_scramble(settings.seed, iteration)
+        guide = self.prepare(iteration)
 
         def trace_camera() -> None:
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
 
-        guide = self._guide_of(iteration)
         with launcher.overlap("primary", trace_camera), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
@@ -161,12 +168,12 @@ class VplEstimator:
                 light_paths=settings.light_paths,
                 absorption=settings.absorption,
                 max_bounces=settings.max_bounces,
-                scramble=scramble,
+                scramble=sobol.iteration_scramble(settings.seed, iteration),
             )
             vpl_sets = build_sets(vpls, guide, self._scratch)
         gathering = GatherSettings()
         gathering.first_column, gathering.first_row = self._camera.first_column, self._camera.first_row
-        gathering.scramble = wp.uint32(scramble ^ _GATHER_STREAM)
+        gathering.scramble = self._scramble
         gathering.rays, gathering.compensation_rays = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_COMPENSATION_SHADOW_RAYS)
         gathering.max_bounces = settings.max_bounces
         with launcher.phase("gather"):

@@ -37,6 +37,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MAX_WAVE = 2**20
 """Largest number of pixels of a wave: several times what a GPU runs at once. A wave takes some 90 bytes a pixel."""
+_GATHER_STREAM = wp.constant(wp.uint32(0x5BD1E995))  # decorrelates gathering from the light paths
 _KEY_BITS = MAX_SETS.bit_length()
 _REFLECTS_NOTHING = wp.constant(MAX_SETS)
 """Sort key of a pixel that evaluates no set; those of others are smaller."""
@@ -48,7 +49,7 @@ class GatherSettings:
 
     first_column: int  # of the film in the image, as in `CameraData`
     first_row: int
-    scramble: wp.uint32
+    scramble: wp.array[wp.uint32]  # [1], that of the light paths
     rays: wp.vec2i  # shadow rays to VPLs on lights and on surfaces
     compensation_rays: wp.vec2i  # shadow rays at the end of a compensation ray
     max_bounces: int
@@ -71,11 +72,17 @@ class Wave:
 
 
 @wp.func
+def gather_scramble(settings: GatherSettings) -> wp.uint32:
+    """The scramble of the pixels' sequence."""
+    return settings.scramble[0] ^ _GATHER_STREAM
+
+
+@wp.func
 def sample_index(settings: GatherSettings, gbuffer: GBuffer, pixel: int) -> int:
     """The index of a pixel's point of the sequence, by its place in the image: a crop has the same pixels."""
     column = settings.first_column + pixel % gbuffer.tiles.columns
     row = settings.first_row + pixel // gbuffer.tiles.columns
-    return sobol.index_of_pixel(column, row, settings.scramble)
+    return sobol.index_of_pixel(column, row, gather_scramble(settings))
 
 
 @wp.struct
@@ -134,7 +141,7 @@ def _write_keys(
     if pixel >= 0:
         index = sample_index(settings, gbuffer, pixel)
         sets = wp.max(vpl_sets[ON_LIGHTS].sets, vpl_sets[ON_SURFACES].sets)
-        wave.keys[i] = int(sobol.sample_1d(scene.sobol, index, 0, settings.scramble) * float(sets))
+        wave.keys[i] = int(sobol.sample_1d(scene.sobol, index, 0, gather_scramble(settings)) * float(sets))
 
 
 @wp.kernel
@@ -149,8 +156,8 @@ def _draw_vpls(
     if pixel < 0:
         return
     index = sample_index(settings, gbuffer, pixel)
-    u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
-    u = sobol.sample_1d(scene.sobol, index, 1 + kind, settings.scramble)
+    u_set = sobol.sample_1d(scene.sobol, index, 0, gather_scramble(settings))
+    u = sobol.sample_1d(scene.sobol, index, 1 + kind, gather_scramble(settings))
     x = camera_vertex(gbuffer, pixel)
     group = vpl_sets[kind]
     set_index = int(u_set * float(group.sets))
@@ -194,7 +201,7 @@ def _compensate(
     if pixel < 0:
         return
     index = sample_index(settings, gbuffer, pixel)
-    v = sobol.sample_2d(scene.sobol, index, 3, settings.scramble)
+    v = sobol.sample_2d(scene.sobol, index, 3, gather_scramble(settings))
     compensation = compensate(scene, camera_vertex(gbuffer, pixel), v, vpl_sets[ON_LIGHTS].bound)
     if compensation.clamped > 0.0:
         wave.continues[i] = 1

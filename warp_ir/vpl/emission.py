@@ -85,7 +85,7 @@ class VplBuffer:
 class LightPathSettings:
     """How light paths are sampled, how they end, and how many of their VPLs can be stored."""
 
-    scramble: wp.uint32
+    scramble: wp.array[wp.uint32]  # [1], on the device, so that iterations differ in it alone
     paths: int  # light paths started
     on_lights: int  # number of light paths, the first ones, whose point on the light is stored as a VPL
     max_bounces: int
@@ -114,7 +114,7 @@ def _surface_row(settings: LightPathSettings, number: int, total: int) -> int:
     """
     if total <= settings.capacity:
         return settings.on_lights + number
-    offset = sobol.hash_combine(settings.scramble ^ _THINNING_STREAM, wp.uint32(0)) % wp.uint32(total)
+    offset = sobol.hash_combine(settings.scramble[0] ^ _THINNING_STREAM, wp.uint32(0)) % wp.uint32(total)
     before = (wp.int64(number) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     after = (wp.int64(number + 1) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     return wp.where(after > before, settings.on_lights + int(before), -1)
@@ -161,17 +161,17 @@ def _trace_segment(
     """
     importance = settings.importance
     dimension = wp.where(bounce == 1, 3, _FIRST_BOUNCE_DIMENSION + 3 * (bounce - 2))
-    u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
+    u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble[0])
     v = wp.vec2(0.0)
     floor = float(0.0)
     if bounce == 1:
-        v = sobol.sample_2d(scene.sobol, i, 5, settings.scramble)
+        v = sobol.sample_2d(scene.sobol, i, 5, settings.scramble[0])
         floor = floor_at_emission(importance)
     elif importance.candidates > 1:
         floor = floor_from(importance, position, normal)
     choice = float(0.0)
     if importance.candidates > 1:
-        choice = _survival_sample(settings.scramble ^ _CHOICE_STREAM, i, bounce)
+        choice = _survival_sample(settings.scramble[0] ^ _CHOICE_STREAM, i, bounce)
     out = _Segment()
     out.hit.triangle = -1
     sum_of_weights = float(0.0)
@@ -226,8 +226,8 @@ def _trace_light_path(
     `total`, from which `_surface_row` gives its row. With skip = 0 the point on the light is written to row i.
     """
     scene = scene_at(address)[0]
-    u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble)
-    u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble)
+    u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble[0])
+    u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble[0])
     light = sample_light(scene, u_pick, u)
     path_weight = 1.0 / float(settings.paths)
     if skip == 0 and i < settings.on_lights:
@@ -253,7 +253,7 @@ def _trace_light_path(
         hit = segment.hit
         flux = segment.flux
         if bounce == 1 and light.modifier_row >= 0:
-            u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble)
+            u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble[0])
             landing = first_reflection(scene, light.modifier_row, hit, segment.direction, u_mesh)
             hit = landing.hit
             flux = flux * landing.weight
@@ -271,7 +271,7 @@ def _trace_light_path(
                 reflected = wp.cw_mul(flux, rho) * (path_weight / wp.pi)
                 survival = path_survival(settings.importance, hit.position, hit.normal, reflected, survival)
             dimension = _FIRST_BOUNCE_DIMENSION + 3 * bounce - 1
-            if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble) >= survival:
+            if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble[0]) >= survival:
                 break
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
@@ -281,7 +281,7 @@ def _trace_light_path(
         if settings.importance.survival_threshold > 0.0:
             probability = survival_probability(settings.importance, hit.position, hit.normal, intensity)
             intensity = intensity / probability
-            survives = _survival_sample(settings.scramble, i, bounce) < probability
+            survives = _survival_sample(settings.scramble[0], i, bounce) < probability
         if survives:
             vpl_count += 1
             if vpl_count > skip and vpl_count <= end:
@@ -442,7 +442,7 @@ def _path_settings(
 ) -> LightPathSettings:
     """Settings of light paths that end by Russian roulette; what is recorded or stored is left to the caller."""
     settings = LightPathSettings()
-    settings.scramble = wp.uint32(scramble)
+    settings.scramble = scratch.number("scramble", scramble, wp.uint32)
     settings.paths, settings.on_lights = paths, on_lights
     settings.photon_target, settings.importance = guide.photon_target, guide.importance
     settings.max_bounces = max_bounces
