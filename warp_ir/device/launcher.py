@@ -314,6 +314,7 @@ class Launcher:
 
         All that it needs must be there already: it may neither allocate nor upload nor read.
         """
+        assert not self.synchronous, "numbers that the host reads would stay what they are"
         self._recording = True
         try:
             with wp.ScopedCapture(device=self.device) as capture:

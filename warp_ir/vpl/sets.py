@@ -287,6 +287,7 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
     keys = scratch.array("sets.keys", max(2 * vpls.capacity, 1), wp.int32)
     order = scratch.array("sets.order", max(2 * vpls.capacity, 1), wp.int32)
     vpl_sets = scratch.array("sets", 2, VplSets)
+    slotted = launcher.wavefront or not launcher.lanes
     settings = SetSettings()
     settings.max_sets = MAX_SETS_OF_BLOCKS if launcher.lanes else MAX_SETS
     settings.extent, settings.area, settings.density = scene.detail_extent, scene.area, guide.density_ratio
@@ -297,7 +298,7 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
         (surfaces, "surfaces", vpls.on_lights, vpls.capacity),
     ):
         most = -(-(end - begin) // LANES) + MAX_SETS_OF_BLOCKS - 1 if launcher.lanes and end > begin else 0
-        slots = end - begin if launcher.wavefront else 0
+        slots = end - begin if slotted else 0
         blocks.append(most)
         group.vpls, group.order = vpls, order[begin:] if end > begin else order
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
@@ -313,6 +314,6 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
     launcher.launch(_pack, sum(blocks), [vpl_sets])
     if lights.shaped:
         launcher.launch(_pack_shaping, blocks[0], [scene.data, vpl_sets])
-    if launcher.wavefront:
+    if slotted:
         launcher.launch(_pack_slots, vpls.capacity, [scene.data, vpl_sets])
     return vpl_sets
