@@ -260,7 +260,7 @@ def test_random_scenes_are_read_back_from_their_stages(tmp_path, seed):
 
 @pytest.mark.extended
 def test_the_gpu_check_runs_without_a_gpu(tmp_path):
-    """A rehearsal on the CPU: every result is a line of JSON, no way to gather changes a bit, no ray escapes, nor light."""
+    """A rehearsal on the CPU: every result is a line of JSON, no way to gather changes a bit, and no ray escapes."""
     import warp as wp
 
     wp.init()

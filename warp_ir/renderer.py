@@ -78,9 +78,14 @@ class Renderer:
         estimator = ESTIMATORS[settings.estimator]
         with self.launcher.loading():
             build = [warp_ir.bvh.build] if self.launcher.device.is_cpu else []
-            self.launcher.load([*build, *estimator.MODULES])  # what takes longest comes first
-            self._upload(scene)
-            self.launcher.load([*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES])
+            last = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
+            if self.launcher.wavefront:  # all side by side, before the upload
+                self.launcher.load([*estimator.MODULES, *estimator.WAVEFRONT_MODULES, *last])
+                self._upload(scene)
+            else:
+                self.launcher.load([*build, *estimator.MODULES])  # what takes longest comes first
+                self._upload(scene)
+                self.launcher.load(last)
 
     def update(self, scene: Scene) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.

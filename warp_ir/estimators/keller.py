@@ -68,6 +68,7 @@ class Keller:
     """Every VPL, every shadow ray."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, sys.modules[__name__])
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = ()
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""

@@ -243,6 +243,7 @@ class PathTracer:
     """Path tracing with next-event estimation, unidirectional but for the spots of small lights."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, sys.modules[__name__])
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = ()
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""

@@ -19,7 +19,6 @@ from typing import ClassVar
 
 import warp as wp
 
-import warp_ir.estimators.wavefront
 import warp_ir.gbuffer
 import warp_ir.guiding.probes
 import warp_ir.vpl.emission
@@ -27,6 +26,7 @@ import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
+from warp_ir.estimators import wavefront
 from warp_ir.estimators.wavefront import (
     GatherSettings,
     Wave,
@@ -131,6 +131,7 @@ class VplEstimator:
     """VPLs with resampled visibility, bounded and compensated; light paths are guided."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.vpl.sets)
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = (wavefront, warp_ir.guiding.probes)
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
@@ -141,8 +142,6 @@ class VplEstimator:
         """The guide, once it has been learned."""
         guiding = settings.guiding
         self._first_guided = math.inf if guiding is None or not scene.emits else guiding.first_iteration
-        if self._launcher.wavefront:
-            self._launcher.load([warp_ir.estimators.wavefront])
         if settings.iteration_limit > self._first_guided:
             self._launcher.load([warp_ir.guiding.probes])
 
