@@ -106,3 +106,21 @@ def test_a_gpu_traces_as_many_paths_as_it_holds():
     assert launcher.max_light_paths() == 32768
     assert ir.RenderSettings(width=1920, height=1080).resolve(max_paths=32768).light_paths == 32768
     assert ir.RenderSettings(width=128, height=128).resolve(max_paths=32768).light_paths == 2048
+
+
+def test_modules_are_compiled_side_by_side(monkeypatch):
+    """Where gathering is in waves, as on a GPU, everything is asked for at once, and before the upload."""
+    asked = []
+    plain = Launcher.__init__
+
+    def as_on_a_gpu(self, *args):
+        plain(self, *args)
+        self.wavefront = True
+
+    monkeypatch.setattr(Launcher, "__init__", as_on_a_gpu)
+    monkeypatch.setattr(Launcher, "load", lambda _, modules: asked.append([m.__name__ for m in modules]))
+    monkeypatch.setattr(Renderer, "_upload", lambda *_: asked.append("upload"))
+    Renderer(cornell_box(), ir.RenderSettings(**{**SETTINGS, "filter": True}))
+    first, upload = asked
+    assert upload == "upload" and len(first) == len(set(first)) > 7
+    assert {"warp_ir.vpl.emission", "warp_ir.estimators.wavefront", "warp_ir.guiding.probes"} <= set(first)
