@@ -110,8 +110,8 @@ def agreement(options: argparse.Namespace) -> Iterator[Record]:
         error = float(np.sqrt(sum(m.var(ddof=1) for m in means) / len(cpu)))
         level = float(means[0].mean())
         difference = float(means[1].mean()) - level
-        # The same samples give the same mean up to rays at edges. In vpl a light path that meets an edge otherwise moves
-        # the sets of all that follow it: then means agree within the noise.
+        # The same samples give the same mean up to rays at edges. In vpl a light path that takes another way at an edge
+        # moves the sets of those that follow it: then means agree within the noise.
         close = abs(difference) <= max(2e-3 * level, 5.0 * error)
         different = float((np.abs(cpu - gpu).max(axis=3) > 2e-3 * level).mean())
         same = different <= 0.05 or more.get("estimator", "vpl") == "vpl"
