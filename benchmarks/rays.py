@@ -26,10 +26,10 @@ import warp_ir as ir
 from warp_ir.device.launcher import Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData, camera_data, upload_scene
-from warp_ir.estimators.keller import geometry_term
 from warp_ir.gbuffer import GBuffer, camera_ray, new_gbuffer, trace_primary
 from warp_ir.settings import UNLIMITED
 from warp_ir.surface import closest, visible
+from warp_ir.vpl.contribution import geometry_term
 from warp_ir.vpl.emission import VplBuffer, emit_vpls
 from warp_ir.vpl.guide import unguided
 

@@ -110,7 +110,8 @@ def agreement(options: argparse.Namespace) -> Iterator[Record]:
         error = float(np.sqrt(sum(m.var(ddof=1) for m in means) / len(cpu)))
         level = float(means[0].mean())
         difference = float(means[1].mean()) - level
-        # The same samples give the same mean up to rays at edges; other ones, as vpl's are, within the noise.
+        # The same samples give the same mean up to rays at edges. In vpl a light path that takes another way at an edge
+        # moves the sets of those that follow it: then means agree within the noise.
         close = abs(difference) <= max(2e-3 * level, 5.0 * error)
         different = float((np.abs(cpu - gpu).max(axis=3) > 2e-3 * level).mean())
         same = different <= 0.05 or more.get("estimator", "vpl") == "vpl"
@@ -121,6 +122,81 @@ def agreement(options: argparse.Namespace) -> Iterator[Record]:
             "z": difference / error if error > 0.0 else 0.0,
             "different_pixels": different,
         }
+
+
+WAYS: dict[str, Record] = {
+    "as it is": {},
+    "without graphs": {"graphs": False},
+    "pixels in no order": {"_KEY_BITS": 0},
+    "short waves": {"MAX_WAVE": 4096},
+    "one kernel": {"wavefront": False},
+}
+"""Ways to gather: attributes of the launcher, or of `estimators.wavefront`. The first four have the same bits."""
+
+
+def _gather(scene: Any, way: str, device: str, iterations: int, **settings: Any) -> tuple[Any, float, float, Any]:
+    """A picture made in one of the `WAYS`, its seconds an iteration by the clock and in gathering, and its film."""
+    import warp_ir as ir
+    from warp_ir.estimators import wavefront
+    from warp_ir.renderer import Renderer
+
+    renderer = Renderer(scene, ir.RenderSettings(iterations=iterations, **settings), device=device)
+    launcher, before = renderer.launcher, {name: getattr(wavefront, name) for name in ("_KEY_BITS", "MAX_WAVE")}
+    launcher.wavefront, launcher.graphs, launcher.synchronous = True, True, False  # the CPU rehearses it
+    for name, value in WAYS[way].items():
+        setattr(launcher if hasattr(launcher, name) else wavefront, name, value)
+    try:
+        film, warm_up = renderer.new_film(), 3  # kernel by kernel, recorded, replayed
+        for k in range(iterations):
+            if k == warm_up:
+                begin, phases = time.perf_counter(), launcher.profile.seconds()
+            renderer.add_iteration(film, k)
+        seconds = (time.perf_counter() - begin) / (iterations - warm_up)
+        gathering = launcher.profile.since(phases)["gather"] / (iterations - warm_up)
+        renderer._report_profile(film)
+    finally:
+        for name, value in before.items():
+            setattr(wavefront, name, value)
+    return film.radiance(), seconds, gathering, film
+
+
+def gathering(options: argparse.Namespace) -> Iterator[Record]:
+    """Graphs, the order of pixels and the size of waves change no bit; and what each of them gains."""
+    import numpy as np
+    import warp as wp
+    from random_scenes import random_scene
+
+    from warp_ir.procedural import cornell_box
+
+    sizes = [(64, 64)] if options.quick else [(256, 256), (1920, 1080)]
+    for (name, scene), (width, height) in (
+        (case, size) for size in sizes for case in (("cornell box", cornell_box()), ("crowd", random_scene(8)))
+    ):
+        expected = None
+        for way in WAYS:
+            iterations = 5 if options.quick else 13
+            found, seconds, gathered, film = _gather(scene, way, options.device, iterations, width=width, height=height)
+            expected = found if expected is None else expected
+            different = float((np.abs(found - expected).max(axis=2) > 1e-3 * expected.mean()).mean())
+            # One kernel draws the same VPLs, but for rounding.
+            same = np.array_equal(found, expected) if way != "one kernel" else different <= 0.01
+            replayed = film.counts["graph_launches"] > 0 or way == "without graphs"
+            yield {
+                "name": f"{name}, {width} x {height}, {way}",
+                "ok": bool(same and replayed),
+                "iterations_per_second": 1.0 / seconds,
+                "gather_seconds": gathered,
+                "different_pixels": different,
+                "graph_launches": film.counts["graph_launches"],
+            }
+    if wp.get_device(options.device).is_cuda:
+        wp.timing_begin(wp.TIMING_KERNEL | wp.TIMING_MEMSET | wp.TIMING_MEMCPY)
+        _gather(random_scene(8), "without graphs", options.device, 13, width=1920, height=1080)
+        spent: dict[str, list[float]] = {}
+        for result in wp.timing_end():
+            spent.setdefault(result.name, []).append(result.elapsed)
+        for name, times in sorted(spent.items(), key=lambda item: -sum(item[1]))[:25]:
+            yield {"name": f"kernel {name}", "milliseconds": sum(times) / len(times), "launches": len(times)}
 
 
 def leaks(options: argparse.Namespace) -> Iterator[Record]:
@@ -276,10 +352,11 @@ def error(options: argparse.Namespace) -> Iterator[Record]:
 
 STEPS: dict[str, tuple[Callable[[argparse.Namespace], Iterator[Record]], float]] = {
     "start": (start, 60.0),
-    "agreement": (agreement, 110.0),
-    "tests": (tests, 90.0),
+    "agreement": (agreement, 100.0),
+    "gathering": (gathering, 40.0),
+    "tests": (tests, 70.0),
     "leaks": (leaks, 40.0),
-    "speed": (speed, 80.0),
+    "speed": (speed, 70.0),
     "rays_per_second": (rays_per_second, 40.0),
     "error": (error, 60.0),
 }

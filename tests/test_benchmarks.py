@@ -284,15 +284,15 @@ def test_random_scenes_are_read_back_from_their_stages(tmp_path, seed):
 
 @pytest.mark.extended
 def test_the_gpu_check_runs_without_a_gpu(tmp_path):
-    """A rehearsal on the CPU: every result is a line of JSON, and no ray escapes, nor light."""
+    """A rehearsal on the CPU: every result is a line of JSON, no way to gather changes a bit, and no ray escapes."""
     import warp as wp
 
     wp.init()
     script = BENCHMARKS.parent / "scripts" / "gpu_check.py"
     command = [sys.executable, str(script), "--device", "cpu", "--quick", "--out", str(tmp_path), "--minutes", "60"]
     environment = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}
-    subprocess.run([*command, "--only", "start", "leaks"], check=True, env=environment)
+    subprocess.run([*command, "--only", "start", "gathering", "leaks"], check=True, env=environment)
     lines = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
-    assert {line["step"] for line in lines} == {"start", "leaks"}
+    assert {line["step"] for line in lines} == {"start", "gathering", "leaks"}
     assert all(line["ok"] for line in lines)
     assert "## leaks: done" in (tmp_path / "summary.md").read_text()

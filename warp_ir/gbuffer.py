@@ -212,7 +212,12 @@ def lens_point(scene: SceneData, camera: CameraData, pixel: int, iteration: int,
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_primary(
-    first: int, scene: SceneData, camera: CameraData, iteration: int, seed: wp.uint32, gbuffer: GBuffer
+    first: int,
+    scene: SceneData,
+    camera: CameraData,
+    iteration: wp.array[wp.int32],
+    seed: wp.uint32,
+    gbuffer: GBuffer,
 ) -> None:
     """Traces one camera ray; iteration -1 goes through the centre of the pixel and of the lens."""
     index = first + wp.tid()
@@ -221,8 +226,10 @@ def _trace_primary(
         return
     u_pixel = wp.vec2(0.5, 0.5)
     lens = wp.vec2(0.0, 0.0)
-    if iteration >= 0:
-        sample = iteration - skipped_iterations(gbuffer.tiles, index)  # a pixel uses all points of its sequence in turn
+    if iteration[0] >= 0:
+        sample = iteration[0] - skipped_iterations(
+            gbuffer.tiles, index
+        )  # a pixel uses all points of its sequence in turn
         u_pixel = jitter(scene, camera, pixel, sample, seed)
         lens = lens_point(scene, camera, pixel, sample, seed)
     hit_record = trace_camera_ray(scene, camera, camera_ray(camera, pixel, u_pixel, lens))
@@ -325,14 +332,16 @@ def trace_primary(
     launcher: Launcher,
     gbuffer: GBuffer,
     *,
-    iteration: int,
+    iteration: "int | wp.array[wp.int32]",
     seed: int,
     counted_as: str = "primary_rays",
 ) -> None:
     """Fills the tiles of the G-buffer with what the camera sees in one iteration; -1: through the pixels' centres.
 
-    The profile counts the rays under the name `counted_as`.
+    The number of the iteration may be an array on the device [1]. The profile counts the rays under the name
+    `counted_as`.
     """
     count = indices(gbuffer.tiles)
-    launcher.launch(_trace_primary, count, [scene.data, camera, iteration, wp.uint32(seed), gbuffer])
+    number = launcher.array([iteration], wp.int32) if isinstance(iteration, int) else iteration
+    launcher.launch(_trace_primary, count, [scene.data, camera, number, wp.uint32(seed), gbuffer])
     launcher.profile.counts[counted_as] += gbuffer.tiles.pixels

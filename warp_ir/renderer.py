@@ -20,6 +20,7 @@ import warp as wp
 
 import warp_ir.bvh.build
 from warp_ir.coverage import SAMPLES, measure_coverage
+from warp_ir.device.graph import RepeatedLaunches
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_scenes
@@ -81,9 +82,13 @@ class Renderer:
         after = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
         with self.launcher.loading():
             self.launcher.expect([*before, *after])
-            self.launcher.load(before)  # what takes longest comes first
-            self._upload(scene)
-            self.launcher.load(after)
+            if self.launcher.wavefront:  # a GPU's code takes longest: all side by side, before the upload
+                self.launcher.load([*before, *estimator.WAVEFRONT_MODULES, *after])
+                self._upload(scene)
+            else:
+                self.launcher.load(before)  # what takes longest comes first
+                self._upload(scene)
+                self.launcher.load(after)
 
     def update(self, scene: Scene, settings: RenderSettings | None = None) -> None:
         """Replaces the scene, and uploads only what the two scenes do not share.
@@ -160,10 +165,16 @@ class Renderer:
             self._gbuffer.tiles = film.tiles
             number = stratum(iteration, len(self._shutter).bit_length() - 1)
             state = self._shutter[number]
-            state.estimator.estimate(iteration, self._gbuffer)
-            # An iteration is added whole or not at all.
-            with self.launcher.phase("film"), self.launcher.uninterruptible():
-                film.add(self._gbuffer, state.exposure, number)
+
+            def launches() -> None:
+                state.estimator.estimate(iteration, self._gbuffer)
+                # An iteration is added whole or not at all.
+                with self.launcher.phase("film"), self.launcher.uninterruptible():
+                    film.accumulate(self._gbuffer, state.exposure, number)
+
+            prepared = state.estimator.prepare(iteration)
+            state.launches.run((film, film.tiles, self._block, prepared), launches)
+            film.count_iteration()
             wp.synchronize_device(self.launcher.device)
 
     def render(
@@ -229,7 +240,7 @@ class Renderer:
         If it refuses, the settings stay as they were.
         """
         wanted = settings or self.wanted
-        resolved = wanted.resolve(scene.camera.aspect, self._guiding)
+        resolved = wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
         needed, available = columns * rows * pixel_bytes(scene, resolved), self.launcher.memory()
@@ -252,7 +263,8 @@ class Renderer:
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
             estimator = ESTIMATORS[settings.estimator](device_scene, camera, settings, self._scratch)
-            self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure))
+            launches = RepeatedLaunches(self._scratch)
+            self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure, launches))
         if camera.blurs and settings.filter:
             launcher.load(BLUR_MODULES)
         layout = _BufferLayout(
@@ -301,6 +313,7 @@ class Renderer:
             film.counts[what] = film.counts.get(what, 0) + counts[what] - self._reported[1].get(what, 0)
         film.counts["iterations"] = film.iterations
         film.counts["skipped_samples"] = film.skipped
+        film.counts.setdefault("graph_launches", 0)
         self._reported = seconds, counts
 
 
@@ -312,6 +325,7 @@ class _ShutterState:
     camera: CameraData
     estimator: Estimator
     exposure: float
+    launches: RepeatedLaunches
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ class RenderSettings:
     )
     light_paths: int | None = _setting(
         None,
-        "light paths per iteration; a power of two is best; by default 512 for keller, and for vpl 1024 to 4096"
-        " depending on the number of pixels",
+        "light paths per iteration; a power of two is best; by default 512 for keller, and for vpl one for every eight"
+        " pixels, from 1024 to 4096, on a GPU to as many as it traces at once",
     )
     max_bounces: int | None = _setting(
         None,
@@ -130,12 +130,15 @@ class RenderSettings:
             return self.iterations
         return 64 if self.time_limit is None and self.target_error is None else math.inf
 
-    def resolve(self, aspect: float = 1.0, guiding: "GuidingSettings | None" = None) -> "ResolvedSettings":
+    def resolve(
+        self, aspect: float = 1.0, guiding: "GuidingSettings | None" = None, max_paths: int = 4096
+    ) -> "ResolvedSettings":
         """These settings with every default filled in.
 
         Args:
             aspect: Width over height of the camera's window: it gives the height where none is set.
             guiding: When light paths are guided; None: never.
+            max_paths: Largest default of `light_paths` for vpl, a power of two: `Launcher.max_light_paths`.
 
         Raises:
             InputError: The picture has too many pixels.
@@ -144,7 +147,7 @@ class RenderSettings:
         keller = self.estimator == "keller"
         # For keller every VPL is a ray at every pixel. For vpl there is a light path for every eight pixels, within
         # limits: more would take longer to trace than what they light takes to gather.
-        default_paths = 1 << (min(max(self.width * height // 8, 1024), 4096).bit_length() - 1)
+        default_paths = 1 << (min(max(self.width * height // 8, 1024), max_paths).bit_length() - 1)
         values = self.to_dict() | {
             "height": height,
             "light_paths": self.light_paths or (512 if keller else default_paths),

@@ -58,14 +58,25 @@ def node_count(tree: wp.uint64) -> int:
 #if defined(__CUDA_ARCH__)
     const auto product = [](float a, float b) { return __fmul_rn(a, b); };
     const auto difference = [](float a, float b) { return __fsub_rn(a, b); };
+    const auto load = [](const wp::BVHPackedNodeHalf* half) {  // 16 bytes at once
+        static_assert(sizeof(wp::BVHPackedNodeHalf) == sizeof(float4));
+        const float4 v = __ldg(reinterpret_cast<const float4*>(half));
+        wp::BVHPackedNodeHalf out;
+        out.x = v.x, out.y = v.y, out.z = v.z;
+        out.i = __float_as_uint(v.w) & 0x7FFFFFFFu, out.b = __float_as_uint(v.w) >> 31;
+        return out;
+    };
 #else
     #pragma clang fp contract(off)
     const auto product = [](float a, float b) { return a * b; };
     const auto difference = [](float a, float b) { return a - b; };
+    const auto load = [](const wp::BVHPackedNodeHalf* half) { return *half; };
 #endif
     const wp::Mesh& triangles = *(const wp::Mesh*)mesh;
     const wp::BVH& bvh = triangles.bvh;
     const float sx = direction[x] / direction[z], sy = direction[y] / direction[z], sz = 1.0f / direction[z];
+    // Looked up once: an index that is not constant keeps a vector out of registers.
+    const float ox = origin[x], oy = origin[y], oz = origin[z];
     const float pad_x = error[x] + fabsf(sx) * error[z], pad_y = error[y] + fabsf(sy) * error[z];
     wp::vec_t<4, double> hit(-1.0, t_max, 0.0, 0.0);
     // Warp's trees have at most 32 levels.
@@ -77,16 +88,16 @@ def node_count(tree: wp.uint64) -> int:
     while (depth > 0) {
         const int node = stack[--depth];
         if (stack_t[depth] >= t_max) continue;
-        const wp::BVHPackedNodeHalf first = bvh.node_lowers[node], second = bvh.node_uppers[node];
+        const wp::BVHPackedNodeHalf first = load(bvh.node_lowers + node), second = load(bvh.node_uppers + node);
         if (first.b) {
             for (int i = first.i; i < (int)second.i; ++i) {
                 const int triangle = bvh.primitive_indices[i];
                 float px[3], py[3], pz[3];
                 for (int k = 0; k < 3; ++k) {
                     const wp::vec3& corner = triangles.points[triangles.indices[3 * triangle + k]];
-                    pz[k] = difference(corner[z], origin[z]);
-                    px[k] = difference(difference(corner[x], origin[x]), product(sx, pz[k]));
-                    py[k] = difference(difference(corner[y], origin[y]), product(sy, pz[k]));
+                    pz[k] = difference(corner[z], oz);
+                    px[k] = difference(difference(corner[x], ox), product(sx, pz[k]));
+                    py[k] = difference(difference(corner[y], oy), product(sy, pz[k]));
                 }
                 const float u = difference(product(px[2], py[1]), product(py[2], px[1]));
                 const float v = difference(product(px[0], py[2]), product(py[0], px[2]));
@@ -96,8 +107,9 @@ def node_count(tree: wp.uint64) -> int:
                 const float ew = fabsf(py[0] - py[1]) * pad_x + fabsf(px[0] - px[1]) * pad_y;
                 const bool inside = ((u >= -eu) & (v >= -ev) & (w >= -ew)) | ((u <= eu) & (v <= ev) & (w <= ew));
                 const float determinant = u + v + w;
+                if (!inside || determinant == 0.0f) continue;
                 const float t = sz * (u * pz[0] + v * pz[1] + w * pz[2]) / determinant;
-                if (inside && determinant != 0.0f && t >= 0.0f && t < t_max) {
+                if (t >= 0.0f && t < t_max) {
                     t_max = t;
                     hit = wp::vec_t<4, double>(determinant > 0.0f ? 2.0 * triangle + 1.0 : 2.0 * triangle, t,
                                                u / determinant, v / determinant);
@@ -108,7 +120,8 @@ def node_count(tree: wp.uint64) -> int:
             const int children[2] = {(int)first.i, (int)second.i};
             float t[2];
             for (int k = 0; k < 2; ++k) {
-                const wp::BVHPackedNodeHalf lower = bvh.node_lowers[children[k]], upper = bvh.node_uppers[children[k]];
+                const wp::BVHPackedNodeHalf lower = load(bvh.node_lowers + children[k]);
+                const wp::BVHPackedNodeHalf upper = load(bvh.node_uppers + children[k]);
                 const float low[3] = {lower.x, lower.y, lower.z}, high[3] = {upper.x, upper.y, upper.z};
                 float near = 0.0f, far = 3.0e38f;
                 for (int axis = 0; axis < 3; ++axis) {

@@ -12,7 +12,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -30,11 +30,16 @@ _MAX_BANDS_PER_THREAD = 64
 _MIN_BAND_SECONDS = 1.0e-4
 """Least duration of a band [s]: taking one costs 5 microseconds."""
 _BLOCK_DIM = 64
+_MAX_LIGHT_PATHS = 4096
+"""Largest default number of light paths on a CPU, where more take longer."""
+_REGISTERS_PER_SM = 65536
 MAX_REGISTERS = 168
 """Registers of a CUDA thread in kernels that trace rays. Without a limit the compiler takes 255, and a multiprocessor
 holds 256 threads; with this limit it holds 384, which hide each other's latencies better. What does not fit is spilled
 to local memory, mostly by callers during traversal. The number is that of Blender's Cycles
 (kernel/device/cuda/config.h); it has not been measured here yet."""
+_THREADS_PER_SM = _REGISTERS_PER_SM // MAX_REGISTERS // 32 * 32
+"""Threads of kernels that trace rays that a multiprocessor holds."""
 
 
 Record = TypeVar("Record")
@@ -85,6 +90,13 @@ class Launcher:
         self.profile = Profile(self.device)
         self.synchronous = self.device.is_cpu
         """Whether a launch has finished when the call returns: then the host reads results without waiting."""
+        self.lanes = self.device.is_cpu
+        """Whether a thread computes in vector registers: then it evaluates sixteen VPLs at once."""
+        self.wavefront = not self.lanes
+        """Whether gathering is a sequence of kernels, one for each step, in which neighbouring threads do the same."""
+        self.graphs = self.device.is_cuda and wp.is_mempool_enabled(self.device)
+        """Whether launches that are repeated are recorded as a graph; sorting in a graph takes a memory pool."""
+        self._recording = False
         self.threads = (threads or _usable_cores()) if self.device.is_cpu else 1
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.exclusive = threading.RLock()
@@ -156,7 +168,7 @@ class Launcher:
             return
         self._wait_for(kernel.module)
         self._modules.load(kernel.module)
-        if self.device.is_cuda:
+        if self.device.is_cuda or self._recording:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
         launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)
@@ -186,7 +198,7 @@ class Launcher:
         The launches must not depend on each other, nor on the block, nor the block on them. On CUDA they run first.
         Their time is added to `phase`, and not to the phases inside the block.
         """
-        if self.device.is_cuda:
+        if self.device.is_cuda or self._recording:
             with self.phase(phase):
                 start()
             yield
@@ -294,12 +306,41 @@ class Launcher:
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Adds the time of the launches inside to the phase `name`."""
+        if self._recording:
+            yield
+            return
         outer, self._phase = self._phase, name
         try:
             with self.profile.phase(name):
                 yield
         finally:
             self._phase = outer
+
+    def record(self, launches: Callable[[], None]) -> Any:
+        """Records what `launches` launches, sorts and scans, as a graph; nothing of it runs.
+
+        All that it needs must be there already: it may neither allocate nor upload nor read.
+        """
+        assert not self.synchronous, "numbers that the host reads would stay what they are"
+        self._recording = True
+        try:
+            with wp.ScopedCapture(device=self.device) as capture:
+                launches()
+        finally:
+            self._recording = False
+        return capture.graph
+
+    def replay(self, graph: Any, shares: Mapping[str, float]) -> None:
+        """Runs what was recorded. Its time is divided among phases by their `shares`.
+
+        Raises:
+            Cancelled: `cancel` was called before it began.
+        """
+        if self._cancelled.is_set():
+            raise Cancelled
+        with self.profile.phases(shares):
+            wp.capture_launch(graph)
+        self.profile.counts["graph_launches"] += 1
 
     def memory(self) -> float:
         """Bytes that may be allocated: the free memory of a GPU, the whole memory of a CPU; infinity if unknown."""
@@ -309,6 +350,15 @@ class Launcher:
             return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         except (AttributeError, OSError, ValueError):
             return math.inf
+
+    def max_light_paths(self) -> int:
+        """Largest default number of light paths, a power of two.
+
+        On a GPU it is what the device runs at once: fewer would leave a part of it idle, and take as long, because a
+        light path is traced one vertex after the other.
+        """
+        threads = self.device.sm_count * _THREADS_PER_SM
+        return max(_MAX_LIGHT_PATHS, 1 << max(threads.bit_length() - 1, 0))
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""

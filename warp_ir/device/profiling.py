@@ -2,8 +2,8 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import warp as wp
@@ -16,14 +16,18 @@ class Profile:
         """A profile of work on a Warp device."""
         self._device = device
         self._seconds: dict[str, float] = defaultdict(float)
-        self._pending: list[tuple[str, Any, Any]] = []
+        self._pending: list[tuple[Mapping[str, float], Any, Any]] = []
         self.counts: Counter[str] = Counter()
         """Counts of rays, light paths, ...; callers add to them."""
         self._tallies: dict[str, Any] = {}
 
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
+    def phase(self, name: str) -> AbstractContextManager[None]:
         """Adds the time spent inside to `name`."""
+        return self.phases({name: 1.0})
+
+    @contextmanager
+    def phases(self, shares: Mapping[str, float]) -> Iterator[None]:
+        """Divides the time spent inside among phases, by their shares."""
         if self._device.is_cuda:
             begin, end = wp.Event(self._device, enable_timing=True), wp.Event(self._device, enable_timing=True)
             wp.record_event(begin)
@@ -31,13 +35,17 @@ class Profile:
                 yield
             finally:
                 wp.record_event(end)
-                self._pending.append((name, begin, end))
+                self._pending.append((shares, begin, end))
         else:
             start = time.perf_counter()
             try:
                 yield
             finally:
-                self._seconds[name] += time.perf_counter() - start
+                self._add(shares, time.perf_counter() - start)
+
+    def _add(self, shares: Mapping[str, float], seconds: float) -> None:
+        for name, share in shares.items():
+            self._seconds[name] += share * seconds
 
     def add(self, name: str, seconds: float) -> None:
         """Adds time that was measured elsewhere."""
@@ -68,7 +76,7 @@ class Profile:
         """Seconds so far, by phase. Waits for pending work of the GPU."""
         if self._pending:
             wp.synchronize_device(self._device)
-            for name, begin, end in self._pending:
-                self._seconds[name] += wp.get_event_elapsed_time(begin, end, synchronize=False) / 1000.0
+            for shares, begin, end in self._pending:
+                self._add(shares, wp.get_event_elapsed_time(begin, end, synchronize=False) / 1000.0)
             self._pending.clear()
         return dict(self._seconds)

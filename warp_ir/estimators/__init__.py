@@ -23,9 +23,17 @@ class Estimator(Protocol):
 
     MODULES: ClassVar[Sequence[ModuleType]]
     """Modules with the kernels that it launches, those that take longest to compile first."""
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]]
+    """Those that it needs besides where `Launcher.wavefront` is true; others are loaded when a scene needs them."""
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a camera and settings; what an iteration overwrites lies in `scratch`."""
+
+    def prepare(self, iteration: int) -> object:
+        """Does what of an iteration no graph can repeat: it uploads numbers, and learns a guide where that is due.
+
+        `estimate` calls it as well. While the result is the same object, `estimate` makes the same launches.
+        """
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""

@@ -68,6 +68,7 @@ class Keller:
     """Every VPL, every shadow ray."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, sys.modules[__name__])
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = ()
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
@@ -77,11 +78,18 @@ class Keller:
         radius = settings.bound_radius * scene.extent
         self._bound = 1.0 / radius**2 if radius > 0.0 else UNBOUNDED
 
+    def prepare(self, iteration: int) -> object:
+        """Uploads the numbers of an iteration."""
+        self._scratch.number("scramble", iteration_scramble(self._settings.seed, iteration), wp.uint32)
+        self._iteration = self._scratch.number("iteration", iteration, wp.int32)
+        return self._unguided
+
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
+        self.prepare(iteration)
         with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
         with launcher.phase("emission"):
             vpls = emit_vpls(
                 self._unguided,

@@ -153,7 +153,7 @@ def _trace_paths(
     scene: SceneData,
     camera: CameraData,
     gbuffer: GBuffer,
-    scramble: wp.uint32,
+    scramble: wp.array[wp.uint32],
     max_bounces: int,
     has_spots: int,
 ) -> None:
@@ -163,7 +163,7 @@ def _trace_paths(
         return
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    stream = sobol.hash_combine(scramble, wp.uint32(image_pixel(camera, pixel)))
+    stream = sobol.hash_combine(scramble[0], wp.uint32(image_pixel(camera, pixel)))
     x = camera_vertex(gbuffer, pixel)
     # Without the reflection at the pixel itself, which the film multiplies by.
     throughput = wp.vec3(wp.where(scene.emitter_count > 0, 1.0, 0.0))
@@ -243,6 +243,7 @@ class PathTracer:
     """Path tracing with next-event estimation, unidirectional but for the spots of small lights."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, sys.modules[__name__])
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = ()
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
@@ -250,11 +251,19 @@ class PathTracer:
         self._scratch, self._launcher = scratch, scratch.launcher
         self._has_spots = _has_small_emitters(scene.source)
 
+    def prepare(self, iteration: int) -> object:
+        """Uploads the numbers of an iteration."""
+        scramble = sobol.iteration_scramble(self._settings.seed, iteration)
+        self._scramble = self._scratch.number("scramble", scramble, wp.uint32)
+        self._iteration = self._scratch.number("iteration", iteration, wp.int32)
+        return self._scene
+
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
+        self.prepare(iteration)
         with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
         with launcher.phase("gather"):
             launcher.launch(
                 _trace_paths,
@@ -263,7 +272,7 @@ class PathTracer:
                     self._scene.data,
                     self._camera,
                     gbuffer,
-                    wp.uint32(sobol.iteration_scramble(settings.seed, iteration)),
+                    self._scramble,
                     settings.max_bounces,
                     int(self._has_spots),
                 ],

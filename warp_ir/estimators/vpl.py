@@ -26,13 +26,22 @@ import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, SceneData
+from warp_ir.estimators import wavefront
+from warp_ir.estimators.wavefront import (
+    GatherSettings,
+    Wave,
+    compensate,
+    continuing_paths,
+    gather_in_waves,
+    gather_scramble,
+    sample_index,
+    wave_pixel,
+)
 from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
 from warp_ir.guiding import learn
-from warp_ir.lights import clamped_fraction, clamped_light_radiance, clamped_surface_radiance
 from warp_ir.sampling import sobol
-from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.settings import ResolvedSettings
-from warp_ir.surface import albedo, closest, geometry_term_of_hit, shading_point, shadow_ray_origin
+from warp_ir.surface import albedo, shading_point
 from warp_ir.tiles import indices
 from warp_ir.vpl.emission import emit_vpls
 from warp_ir.vpl.gather import gather
@@ -46,19 +55,6 @@ _SHADOW_RAYS = (4, 4)
 _COMPENSATION_SHADOW_RAYS = (2, 2)
 """Shadow rays at the end of a compensation ray, whose light has lost most of its weight."""
 _ROULETTE_DEPTH = wp.constant(2)
-_GATHER_STREAM = 0x5BD1E995  # decorrelates gathering from the light paths
-
-
-@wp.struct
-class GatherSettings:
-    """Parameters of the gathering kernel."""
-
-    first_column: int  # of the film in the image, as in `CameraData`
-    first_row: int
-    scramble: wp.uint32
-    rays: wp.vec2i  # shadow rays to VPLs on lights and on surfaces
-    compensation_rays: wp.vec2i  # shadow rays at the end of a compensation ray
-    max_bounces: int
 
 
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
@@ -68,65 +64,63 @@ def _gather_pixels(
     gbuffer: GBuffer,
     vpl_sets: wp.array[VplSets],
     settings: GatherSettings,
+    wave: Wave,
 ) -> None:
-    """Computes the irradiance over π, direct and indirect, of one pixel."""
-    pixel = reflecting_pixel(gbuffer, first + wp.tid())
+    """Computes the irradiance over π, direct and indirect, of one pixel; or of one whose path continues in a wave.
+
+    There the light at the camera vertex has been gathered already.
+    """
+    i = first + wp.tid()
+    pixel = int(-1)
+    if wave.size == 0:
+        pixel = reflecting_pixel(gbuffer, i)
+    elif i < continuing_paths(wave):
+        i = wave.paths[i]
+        pixel = wave_pixel(gbuffer, wave, i)
     if pixel < 0:
         return
     direct = wp.vec3(0.0)
     indirect = wp.vec3(0.0)
-    # The index depends on the pixel's place in the image, not on the film: a crop has the same pixels.
-    column = settings.first_column + pixel % gbuffer.tiles.columns
-    row = settings.first_row + pixel // gbuffer.tiles.columns
-    index = sobol.index_of_pixel(column, row, settings.scramble)
+    index = sample_index(settings, gbuffer, pixel)
+    scramble = gather_scramble(settings)
     # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
-    u_set = sobol.sample_1d(scene.sobol, index, 0, settings.scramble)
+    u_set = sobol.sample_1d(scene.sobol, index, 0, scramble)
     x = camera_vertex(gbuffer, pixel)
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
-    radius = 1.0 / wp.sqrt(bound.minimum)  # length of compensation rays: farther away G cannot exceed the bound
     depth = int(0)
     rays = settings.rays
     while depth <= settings.max_bounces:
-        u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, settings.scramble)
-        bounces = settings.max_bounces - depth
-        from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
-        from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
-        if depth == 0:
-            direct = from_lights
-            indirect = from_surfaces
+        if depth == 0 and wave.size > 0:
+            direct = wave.irradiance[i]
+            indirect = wave.irradiance[wave.size + i]
         else:
-            indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
+            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, scramble)
+            bounces = settings.max_bounces - depth
+            from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
+            from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
+            if depth == 0:
+                direct = from_lights
+                indirect = from_surfaces
+            else:
+                indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
 
-        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, settings.scramble)
-        direction = square_to_cosine_hemisphere(v, x.shading_normal)
-        if wp.dot(direction, x.normal) <= 0.0:
-            break
-        cosine = wp.dot(direction, x.shading_normal)
-        origin = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
-        hit = closest(scene, origin, direction, radius)
-        t_max = wp.where(hit.triangle < 0, radius, hit.t)
-        emitted = clamped_light_radiance(scene, x, direction, t_max, cosine, bound, radius)
-        clamped = float(0.0)
-        if hit.triangle >= 0:
-            g = geometry_term_of_hit(x, direction, hit)
-            clamped = clamped_fraction(bound.minimum, g[0]) * g[1]
-            if clamped > 0.0:
-                emitted += clamped_surface_radiance(scene, hit, direction, g[0], bound, x.mesh) * g[1]
-        emitted = wp.cw_mul(throughput, emitted) * wp.pi
+        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, scramble)
+        compensation = compensate(scene, x, v, bound)
+        emitted = wp.cw_mul(throughput, compensation.emitted) * wp.pi
         if depth == 0:
             direct += emitted
         else:
             indirect += emitted
-        if clamped <= 0.0:
+        if compensation.clamped <= 0.0:
             break
-        throughput = wp.cw_mul(throughput, albedo(scene, hit, scene.footprint)) * clamped
+        throughput = wp.cw_mul(throughput, albedo(scene, compensation.hit, scene.footprint)) * compensation.clamped
         if depth > _ROULETTE_DEPTH:
             survival = wp.min(wp.max(throughput), 0.99)
             if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
                 break
             throughput = throughput / survival
-        x = shading_point(scene, hit)
+        x = shading_point(scene, compensation.hit)
         rays = settings.compensation_rays
         depth += 1
     gbuffer.normal_or_direct[pixel] = direct / wp.pi
@@ -137,6 +131,7 @@ class VplEstimator:
     """VPLs with resampled visibility, bounded and compensated; light paths are guided."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.vpl.sets)
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = (wavefront, warp_ir.guiding.probes)
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
@@ -148,17 +143,23 @@ class VplEstimator:
         guiding = settings.guiding
         self._first_guided = math.inf if guiding is None or not scene.emits else guiding.first_iteration
         if settings.iteration_limit > self._first_guided:
-            scratch.launcher.load([warp_ir.guiding.probes])
+            self._launcher.load([warp_ir.guiding.probes])
+
+    def prepare(self, iteration: int) -> Guide:
+        """Uploads the numbers of an iteration, and learns the guide when it is first needed: the result."""
+        scramble = sobol.iteration_scramble(self._settings.seed, iteration)
+        self._scramble = self._scratch.number("scramble", scramble, wp.uint32)
+        self._iteration = self._scratch.number("iteration", iteration, wp.int32)
+        return self._guide_of(iteration)
 
     def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
         """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
         settings, launcher = self._settings, self._launcher
-        scramble = sobol.iteration_scramble(settings.seed, iteration)
+        guide = self.prepare(iteration)
 
         def trace_camera() -> None:
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=iteration, seed=settings.seed)
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
 
-        guide = self._guide_of(iteration)
         with launcher.overlap("primary", trace_camera), launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
@@ -166,20 +167,20 @@ class VplEstimator:
                 light_paths=settings.light_paths,
                 absorption=settings.absorption,
                 max_bounces=settings.max_bounces,
-                scramble=scramble,
+                scramble=sobol.iteration_scramble(settings.seed, iteration),
             )
             vpl_sets = build_sets(vpls, guide, self._scratch)
         gathering = GatherSettings()
         gathering.first_column, gathering.first_row = self._camera.first_column, self._camera.first_row
-        gathering.scramble = wp.uint32(scramble ^ _GATHER_STREAM)
+        gathering.scramble = self._scramble
         gathering.rays, gathering.compensation_rays = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_COMPENSATION_SHADOW_RAYS)
         gathering.max_bounces = settings.max_bounces
         with launcher.phase("gather"):
-            launcher.launch(
-                _gather_pixels,
-                indices(gbuffer.tiles),
-                [guide.scene.data, gbuffer, vpl_sets, gathering],
-            )
+            inputs = [guide.scene.data, gbuffer, vpl_sets, gathering]
+            if launcher.wavefront:
+                gather_in_waves(_gather_pixels, inputs, self._scratch)
+            else:
+                launcher.launch(_gather_pixels, indices(gbuffer.tiles), [*inputs, Wave()])
 
     def _guide_of(self, iteration: int) -> Guide:
         """The guide of an iteration's light paths; it is learned when it is first needed."""

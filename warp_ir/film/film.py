@@ -149,13 +149,21 @@ class Film:
 
         With motion blur, `shutter_sample` is the number of the shutter sample that it was made at.
         """
+        self.accumulate(gbuffer, exposure, shutter_sample)
+        self.count_iteration()
+
+    def accumulate(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
+        """Does the part of `add` that happens on the device."""
         add_samples(gbuffer, exposure, self._sees_dome, self._data, self._launcher)
         if self.reconstruction is not None:
             self.reconstruction.accumulate(gbuffer, shutter_sample)
+
+    def count_iteration(self) -> None:
+        """Does the part of `add` that happens on the host."""
         self.iterations += 1
         if not self.chosen.all():
             self._skipped += ~self.chosen
-            self.tiles.skipped = self._launcher.array(self._skipped, wp.int32)
+            self.tiles.skipped.assign(self._skipped)
 
     @_exclusive
     def merge(self, other: "Film") -> None:

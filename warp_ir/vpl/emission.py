@@ -85,7 +85,7 @@ class VplBuffer:
 class LightPathSettings:
     """How light paths are sampled, how they end, and how many of their VPLs can be stored."""
 
-    scramble: wp.uint32
+    scramble: wp.array[wp.uint32]  # [1], on the device, so that iterations differ in it alone
     paths: int  # light paths started
     on_lights: int  # number of light paths, the first ones, whose point on the light is stored as a VPL
     max_bounces: int
@@ -93,6 +93,7 @@ class LightPathSettings:
     survivors: wp.array[wp.int32]  # [levels], number of paths that are reflected j times
     levels: int
     recorded: int  # VPLs of a path that are recorded while it is traced
+    again: int  # 1: this launch follows the paths again that have more
     capacity: int  # for VPLs on surfaces; if there are more, an even selection of them stands for all
     photon_target: PhotonTarget
     importance: ViewImportance
@@ -113,7 +114,7 @@ def _surface_row(settings: LightPathSettings, number: int, total: int) -> int:
     """
     if total <= settings.capacity:
         return settings.on_lights + number
-    offset = sobol.hash_combine(settings.scramble ^ _THINNING_STREAM, wp.uint32(0)) % wp.uint32(total)
+    offset = sobol.hash_combine(settings.scramble[0] ^ _THINNING_STREAM, wp.uint32(0)) % wp.uint32(total)
     before = (wp.int64(number) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     after = (wp.int64(number + 1) * wp.int64(settings.capacity) + wp.int64(offset)) // wp.int64(total)
     return wp.where(after > before, settings.on_lights + int(before), -1)
@@ -160,17 +161,17 @@ def _trace_segment(
     """
     importance = settings.importance
     dimension = wp.where(bounce == 1, 3, _FIRST_BOUNCE_DIMENSION + 3 * (bounce - 2))
-    u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble)
+    u = sobol.sample_2d(scene.sobol, i, dimension, settings.scramble[0])
     v = wp.vec2(0.0)
     floor = float(0.0)
     if bounce == 1:
-        v = sobol.sample_2d(scene.sobol, i, 5, settings.scramble)
+        v = sobol.sample_2d(scene.sobol, i, 5, settings.scramble[0])
         floor = floor_at_emission(importance)
     elif importance.candidates > 1:
         floor = floor_from(importance, position, normal)
     choice = float(0.0)
     if importance.candidates > 1:
-        choice = _survival_sample(settings.scramble ^ _CHOICE_STREAM, i, bounce)
+        choice = _survival_sample(settings.scramble[0] ^ _CHOICE_STREAM, i, bounce)
     out = _Segment()
     out.hit.triangle = -1
     sum_of_weights = float(0.0)
@@ -225,8 +226,8 @@ def _trace_light_path(
     `total`, from which `_surface_row` gives its row. With skip = 0 the point on the light is written to row i.
     """
     scene = scene_at(address)[0]
-    u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble)
-    u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble)
+    u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble[0])
+    u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble[0])
     light = sample_light(scene, u_pick, u)
     path_weight = 1.0 / float(settings.paths)
     if skip == 0 and i < settings.on_lights:
@@ -252,7 +253,7 @@ def _trace_light_path(
         hit = segment.hit
         flux = segment.flux
         if bounce == 1 and light.modifier_row >= 0:
-            u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble)
+            u_mesh = sobol.sample_1d(scene.sobol, i, _FIRST_REFLECTION_DIMENSION, settings.scramble[0])
             landing = first_reflection(scene, light.modifier_row, hit, segment.direction, u_mesh)
             hit = landing.hit
             flux = flux * landing.weight
@@ -270,7 +271,7 @@ def _trace_light_path(
                 reflected = wp.cw_mul(flux, rho) * (path_weight / wp.pi)
                 survival = path_survival(settings.importance, hit.position, hit.normal, reflected, survival)
             dimension = _FIRST_BOUNCE_DIMENSION + 3 * bounce - 1
-            if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble) >= survival:
+            if sobol.sample_1d(scene.sobol, i, dimension, settings.scramble[0]) >= survival:
                 break
             flux = wp.cw_mul(flux, rho) / survival
         if wp.max(flux) <= 0.0:
@@ -280,7 +281,7 @@ def _trace_light_path(
         if settings.importance.survival_threshold > 0.0:
             probability = survival_probability(settings.importance, hit.position, hit.normal, intensity)
             intensity = intensity / probability
-            survives = _survival_sample(settings.scramble, i, bounce) < probability
+            survives = _survival_sample(settings.scramble[0], i, bounce) < probability
         if survives:
             vpl_count += 1
             if vpl_count > skip and vpl_count <= end:
@@ -300,14 +301,35 @@ def _trace_light_path(
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_light_paths(
-    first: int, scene: SceneData, settings: LightPathSettings, traced: VplBuffer, lengths: wp.array[wp.int32]
+    first: int,
+    scene: SceneData,
+    settings: LightPathSettings,
+    lengths: wp.array[wp.int32],
+    ends: wp.array[wp.int32],
+    vpls: VplBuffer,
 ) -> None:
     """Traces light path `i`, and records its point on the light and its first VPLs on surfaces.
 
-    Row `on_lights + k paths + i` of `traced` is the path's k-th VPL on a surface.
+    Row `on_lights + k paths + i` of `vpls` is then the path's k-th VPL on a surface. When paths are followed again,
+    those that have more VPLs store them after those of the paths before them, which `ends` counts.
     """
     i = first + wp.tid()
-    lengths[i] = _trace_light_path(scene.address, settings, i, traced, i, settings.paths, 0, 0, settings.recorded)
+    number = i
+    stride = settings.paths
+    total = int(0)
+    skip = int(0)
+    end = settings.recorded
+    if settings.again == 1:
+        if lengths[i] <= settings.recorded:
+            return
+        number = ends[i] - lengths[i]
+        stride = 1
+        total = ends[settings.paths - 1]
+        skip = settings.recorded
+        end = lengths[i]
+    length = _trace_light_path(scene.address, settings, i, vpls, number, stride, total, skip, end)
+    if settings.again == 0:
+        lengths[i] = length
 
 
 @wp.func
@@ -320,7 +342,7 @@ def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weig
         target.lift[to] = source.lift[row]
 
 
-@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+@wp.kernel
 def _store_light_paths(
     first: int,
     scene: SceneData,
@@ -331,7 +353,7 @@ def _store_light_paths(
     vpls: VplBuffer,
     counted: wp.array[wp.int64],
 ) -> None:
-    """Stores light path `i`: its point on the light in row i, its other VPLs after those of the paths before it."""
+    """Stores what is recorded of light path `i`: its point on the light in row i, VPLs after those of earlier paths."""
     i = first + wp.tid()
     total = ends[settings.paths - 1]
     number = ends[i] - lengths[i]
@@ -344,8 +366,6 @@ def _store_light_paths(
         vpls.pdf_area[i] = traced.pdf_area[i]
         if scene.modifier_count > 0:
             vpls.modifiers[i] = traced.modifiers[i]
-    if lengths[i] > settings.recorded:
-        _trace_light_path(scene.address, settings, i, vpls, number, 1, total, settings.recorded, lengths[i])
     if i == settings.paths - 1:
         vpls.count[0] = settings.on_lights + wp.min(total, settings.capacity)
         counted[0] += wp.int64(vpls.count[0])
@@ -402,14 +422,17 @@ def emit_vpls(
     settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
     # Two passes: paths are stored when the lengths of all are known. So every path has its rows without atomics, and no
-    # path has a maximal length; the few that are longer than what was recorded of them are traced again.
+    # path has a maximal length; the few that are longer than what was recorded of them are followed again.
     lengths, ends = scratch.array("lengths", paths, wp.int32), scratch.array("ends", paths, wp.int32)
     traced = _buffer(scene, scratch, "traced", on_lights, paths * settings.recorded)
-    launcher.launch(_trace_light_paths, paths, [scene.data, settings, traced, lengths])
+    launcher.launch(_trace_light_paths, paths, [scene.data, settings, lengths, ends, traced])
     wp.utils.array_scan(lengths[:paths], ends[:paths], inclusive=True)
     vpls = _buffer(scene, scratch, "vpls", on_lights, launcher.row_count(ends[paths - 1 : paths], settings.capacity))
     counted = launcher.profile.tally("vpls")
     launcher.launch(_store_light_paths, paths, [scene.data, settings, traced, lengths, ends, vpls, counted])
+    if settings.recorded < max_bounces:
+        settings.again = 1
+        launcher.launch(_trace_light_paths, paths, [scene.data, settings, lengths, ends, vpls])
     launcher.profile.counts["light_paths"] += paths
     return vpls
 
@@ -419,7 +442,7 @@ def _path_settings(
 ) -> LightPathSettings:
     """Settings of light paths that end by Russian roulette; what is recorded or stored is left to the caller."""
     settings = LightPathSettings()
-    settings.scramble = wp.uint32(scramble)
+    settings.scramble = scratch.number("scramble", scramble, wp.uint32)
     settings.paths, settings.on_lights = paths, on_lights
     settings.photon_target, settings.importance = guide.photon_target, guide.importance
     settings.max_bounces = max_bounces
@@ -445,7 +468,8 @@ def trace_light_vertices(
     settings.recorded, settings.capacity = max_vertices, paths * max_vertices
     vertices = _buffer(guide.scene, scratch, "vertices", paths, settings.capacity)
     lengths = scratch.array("vertices.lengths", paths, wp.int32)
-    scratch.launcher.launch(_trace_light_paths, paths, [guide.scene.data, settings, vertices, lengths])
+    inputs = [guide.scene.data, settings, lengths, lengths, vertices]
+    scratch.launcher.launch(_trace_light_paths, paths, inputs)
     return vertices, lengths
 
 

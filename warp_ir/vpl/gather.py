@@ -3,7 +3,8 @@
 VPL k contributes f_k V_k to a point x, with f_k = I_k min(G(x, y_k), b_k) and the visibility V_k, 0 or 1. Evaluating
 f_k is cheap; V_k costs a ray.
 
-* **Evaluate in blocks.** Sixteen VPLs are evaluated at once in vector registers; a CUDA thread evaluates one at a time.
+* **Evaluate in blocks.** Sixteen VPLs are evaluated at once in vector registers; a CUDA thread evaluates one at a time,
+  the same one as the other threads of its warp (`estimators.wavefront`).
 * **Resample visibility.** M VPLs are drawn in proportion to f, and only they get a shadow ray. With S = Σ f, each
   contributes V S/M, which is unbiased (resampled importance sampling, Talbot et al. 2005; here the M draws are
   systematic along a curve through space).
@@ -23,10 +24,10 @@ from warp_ir.vpl.sets import (
     BLOCK_ROWS,
     LANES,
     SHAPING_ROWS,
+    SLOT_ROWS,
+    SLOT_SHAPING_ROWS,
     VplSets,
-    bound_of,
     draw_weight,
-    intensity_and_bounce,
     vec16,
     vec16i,
 )
@@ -34,21 +35,9 @@ from warp_ir.vpl.sets import (
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _LANES = wp.constant(LANES)
-_MAX_RAYS = wp.constant(8)
-
-
-@wp.func
-def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, bound: float) -> float:
-    """min(G, bound) between a point and a VPL; 0 behind the surface, even where the shading normal faces the VPL."""
-    to_vpl = wp.vec3(position[0], position[1], position[2]) - x.position * position[3]
-    squared = wp.dot(to_vpl, to_vpl) + 1.0e-30
-    inverse = 1.0 / wp.sqrt(squared)
-    direction = to_vpl * inverse
-    at_x = wp.dot(x.shading_normal, direction)
-    at_vpl = normal[3] - wp.dot(wp.vec3(normal[0], normal[1], normal[2]), direction)
-    if at_x <= 0.0 or at_vpl <= 0.0 or wp.dot(x.normal, direction) <= 0.0:
-        return 0.0
-    return wp.min(at_x * at_vpl / squared, bound)
+MAX_RAYS = 8
+"""Largest number of shadow rays of a call."""
+_MAX_RAYS = wp.constant(MAX_RAYS)
 
 
 @wp.func_native("""
@@ -71,7 +60,10 @@ def bounded_geometry_term(x: ShadingPoint, position: wp.vec4, normal: wp.vec4, b
     return f;
 """)
 def _block_bounded_geometry(rows: wp.array[vec16], first: int, x: ShadingPoint) -> vec16:
-    """Mean channel of f for the sixteen VPLs of a block: `bounded_geometry_term` in lanes, without branches."""
+    """Mean channel of f for the sixteen VPLs of a block, without branches.
+
+    It is 0 behind the surface, even where the shading normal faces the VPL.
+    """
     ...
 
 
@@ -269,60 +261,118 @@ def _count_in_lane(group: VplSets, begin: int, lane: int, x: ShadingPoint, targe
 def _gather_one_by_one(
     scene: SceneData, group: VplSets, set_index: int, x: ShadingPoint, u: float, rays: int, max_bounces: int
 ) -> wp.vec3:
-    """The scalar form, for CUDA: one running sum over the VPLs of a set, with M targets along it.
+    """The scalar form, for CUDA.
 
     Rays are traced after the loop, since what the sums need would occupy registers during traversal.
     """
     out = wp.vec3(0.0)
-    begin = set_index * group.blocks * _LANES
-    end = wp.min(begin + group.blocks * _LANES, group.count)
-    total = float(0.0)
-    for slot in range(begin, end):
-        total += _vpl_weight(scene, group, x, slot)
-    if total <= 0.0:
-        return out
-    per_ray = total / float(rays)
-    running = float(0.0)
-    rays_drawn = int(0)
     slots = wp.zeros(shape=_MAX_RAYS, dtype=wp.int32)
-    for slot in range(begin, end):
-        running += _vpl_weight(scene, group, x, slot)
-        while rays_drawn < rays and (float(rays_drawn) + u) * per_ray < running:
-            slots[rays_drawn] = slot
-            rays_drawn += 1
-    for k in range(rays_drawn):
-        slot = slots[k]
-        position = group.vpls.position[group.order[slot]]
-        out += _shadowed_contribution(
-            scene, group, x, slot, position, intensity_and_bounce(group, slot), per_ray, max_bounces
-        )
+    per_ray = draw_slots(group, set_index, x, u, rays, slots, 0, 1)
+    for k in range(rays):
+        if per_ray > 0.0 and slots[k] >= 0:
+            out += slot_contribution(scene, group, x, slots[k], per_ray, max_bounces)
     return out
 
 
 @wp.func
-def _vpl_weight(scene: SceneData, group: VplSets, x: ShadingPoint, slot: int) -> float:
-    vpl = group.order[slot]
-    normal = group.vpls.normal[vpl]
-    bound = bound_of(group, vpl, normal)
-    weight = draw_weight(group, vpl, group.vpls.intensity[vpl])
-    weight *= bounded_geometry_term(x, group.vpls.position[vpl], normal, bound)
-    if group.shaped == 1 and weight > 0.0:
-        weight *= _vpl_shaping(scene, group, vpl, x.position)
-    return weight
+def draw_slots(
+    group: VplSets,
+    set_index: int,
+    x: ShadingPoint,
+    u: float,
+    rays: int,
+    slots: wp.array[wp.int32],
+    first: int,
+    stride: int,
+) -> float:
+    """Draws M VPLs of a set in proportion to f, and returns S/M: one running sum over the set, with M targets along it.
+
+    The k-th is written to `slots[first + k stride]`: its slot, or -1 if none is at the target. Nothing is written where
+    S = 0. The threads of a warp should have the same set: then they load the same rows at the same time.
+    """
+    begin = set_index * group.blocks * _LANES
+    end = wp.min(begin + group.blocks * _LANES, group.count)
+    total = float(0.0)
+    for slot in range(begin, end):
+        total += _slot_weight(group, slot, x)
+    if total <= 0.0:
+        return 0.0
+    per_ray = total / float(rays)
+    running = float(0.0)
+    drawn = int(0)
+    target = u * per_ray
+    for slot in range(begin, end):
+        running += _slot_weight(group, slot, x)
+        while drawn < rays and target < running:
+            slots[first + drawn * stride] = slot
+            drawn += 1
+            target = (float(drawn) + u) * per_ray
+    while drawn < rays:
+        slots[first + drawn * stride] = -1
+        drawn += 1
+    return per_ray
 
 
 @wp.func
-def _vpl_shaping(scene: SceneData, group: VplSets, vpl: int, position: wp.vec3) -> float:
-    """The approximate shaping factor of one VPL on a light, as seen from a position."""
-    row = group.vpls.modifiers[vpl]
-    if row < 0:
-        return 1.0
-    modifiers = scene.light_tables[0].modifiers.rows[row]
-    target = group.vpls.position[vpl]
-    to_light = wp.vec3(target[0], target[1], target[2]) - position * target[3]
-    cosine = -wp.dot(
-        wp.vec3(modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2]), wp.normalize(to_light)
+def slot_contribution(
+    scene: SceneData, group: VplSets, x: ShadingPoint, slot: int, per_ray: float, max_bounces: int
+) -> wp.vec3:
+    """The contribution of a VPL that `draw_slots` has drawn; it sends the shadow ray."""
+    return _shadowed_contribution(
+        scene,
+        group,
+        x,
+        slot,
+        _load4(group.slots, SLOT_ROWS * slot),
+        _load4(group.intensity_bounce, slot),
+        per_ray,
+        max_bounces,
     )
-    if cosine < modifiers.cutoff_cosine:
-        return 0.0
-    return approximate_shaping(modifiers, position, target)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + row);
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[row];
+#endif
+""")
+def _load4(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
+    """A row in one load of 16 bytes, where Warp would load four floats."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return rsqrtf(x);
+#else
+    return 1.0f / sqrtf(x);
+#endif
+""")
+def _reciprocal_root(x: float) -> float:
+    """1/√x; one instruction on CUDA, whose error is 2 ulp."""
+    ...
+
+
+@wp.func
+def _slot_weight(group: VplSets, slot: int, x: ShadingPoint) -> float:
+    """The weight f of one VPL: `_block_weights` for one lane."""
+    p = _load4(group.slots, SLOT_ROWS * slot)
+    n = _load4(group.slots, SLOT_ROWS * slot + 1)
+    weight_bound = _load4(group.slots, SLOT_ROWS * slot + 2)
+    to_vpl = wp.vec3(p[0], p[1], p[2]) - x.position * p[3]
+    inverse = _reciprocal_root(wp.dot(to_vpl, to_vpl) + 1.0e-30)
+    shading = wp.dot(x.shading_normal, to_vpl)
+    facing = n[3] - wp.dot(wp.vec3(n[0], n[1], n[2]), to_vpl) * inverse
+    g = shading * inverse * facing * inverse * inverse
+    weight = wp.min(g, weight_bound[1]) * weight_bound[0]
+    if group.shaped == 1:
+        axis_end = _load4(group.slot_shaping, SLOT_SHAPING_ROWS * slot)
+        ramp = _load4(group.slot_shaping, SLOT_SHAPING_ROWS * slot + 1)
+        cosine = -wp.dot(wp.vec3(axis_end[0], axis_end[1], axis_end[2]), to_vpl) * inverse
+        factor = wp.min(wp.max(ramp[0] * cosine + ramp[1], ramp[2]), 1.0)
+        weight *= wp.where(cosine < axis_end[3], 0.0, factor)
+    if wp.dot(x.normal, to_vpl) > 0.0 and shading > 0.0 and facing > 0.0:
+        return weight
+    return 0.0

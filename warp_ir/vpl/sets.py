@@ -1,4 +1,7 @@
-"""VPLs arranged for evaluation: divided into sets, sorted along a Z-order curve, packed in blocks of sixteen.
+"""VPLs arranged for evaluation: divided into sets, sorted along a Z-order curve, packed for those who evaluate them.
+
+Where a thread has vector lanes, as on a CPU, VPLs are packed in blocks of sixteen. Where threads run in warps, as on a
+GPU, the rows of a VPL lie together: threads that evaluate the same set load them at the same time, 16 bytes at once.
 
 Every set is a contiguous run of VPLs in the order of their paths. A run of a low-discrepancy sequence is itself well
 distributed, so every set alone is an unbiased estimate of the light (interleaved sampling, Keller and Heidrich 2001).
@@ -22,7 +25,12 @@ BLOCK_ROWS = wp.constant(10)
 SHAPING_ROWS = wp.constant(7)
 _BLOCKS_PER_SET = wp.constant(16)
 """A pixel evaluates about 16 x 16 VPLs, which costs a fraction of the shadow rays that follow."""
-_MAX_SETS = wp.constant(64)
+MAX_SETS_OF_BLOCKS = 64
+"""Largest number of sets where a thread has lanes: larger scenes of VPLs have larger sets."""
+MAX_SETS = 2048
+"""Largest number of sets elsewhere. The sequence of pixels has 4096 points (`index_of_pixel`)."""
+SLOT_ROWS = wp.constant(3)
+SLOT_SHAPING_ROWS = wp.constant(2)
 _PI = wp.constant(wp.float64(math.pi))
 UNBOUNDED = wp.constant(3.0e38)
 _LAST = wp.constant(2**31 - 1)
@@ -54,6 +62,8 @@ class VplSets:
     rows: wp.array[vec16]
     shaped: int  # 1: `shaping` has rows
     shaping: wp.array[vec16]
+    slots: wp.array[wp.vec4]  # three rows for each VPL, in the same order: position, normal, (mean intensity, bound)
+    slot_shaping: wp.array[wp.vec4]  # two: the axis and the end of the ramp; its slope, offset and minimum
     order: wp.array[wp.int32]  # rows in `vpls`: set by set, and within a set along a Z-order curve through space
     intensity_bounce: wp.array[wp.vec4]  # in that order: random lookups stay close together
     vpls: VplBuffer
@@ -98,11 +108,11 @@ def _spread_bits(x: int) -> int:
 
 
 @wp.func
-def _divide_blocks(count: int) -> wp.vec2i:
-    """The number of sets (a power of two), and the number of blocks in each."""
+def _divide_blocks(count: int, most: int) -> wp.vec2i:
+    """The number of sets (a power of two, at most `most`), and the number of blocks in each."""
     blocks = (count + _LANES - 1) // _LANES
     sets = int(1)
-    while sets < _MAX_SETS and blocks >= 2 * sets * _BLOCKS_PER_SET:
+    while sets < most and blocks >= 2 * sets * _BLOCKS_PER_SET:
         sets *= 2
     return wp.vec2i(sets, (blocks + sets - 1) // sets)
 
@@ -132,14 +142,22 @@ def _bound(evaluated: int, on_lights: int, density: wp.float64, area: wp.float64
     return out
 
 
+@wp.struct
+class SetSettings:
+    """What the division into sets depends on, apart from the VPLs."""
+
+    max_sets: int
+    extent: float  # edge length of the cube of the Morton codes
+    area: wp.float64  # of all surfaces
+    density: wp.float64  # how much denser guided VPLs lie where they matter
+
+
 @wp.kernel
 def _divide_into_sets(
     first: int,
     lights: VplSets,
     surfaces: VplSets,
-    extent: float,
-    density: wp.float64,
-    area: wp.float64,
+    settings: SetSettings,
     keys: wp.array[wp.int32],
     vpl_sets: wp.array[VplSets],
 ) -> None:
@@ -149,11 +167,11 @@ def _divide_into_sets(
     """
     i = first + wp.tid()
     vpls = lights.vpls
-    of_lights = _divide_blocks(vpls.on_lights)
-    of_surfaces = _divide_blocks(vpls.count[0] - vpls.on_lights)
+    of_lights = _divide_blocks(vpls.on_lights, settings.max_sets)
+    of_surfaces = _divide_blocks(vpls.count[0] - vpls.on_lights, settings.max_sets)
     if i == 0:
         evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
-        bound = _bound(evaluated, _LANES * of_lights[1], density, area)
+        bound = _bound(evaluated, _LANES * of_lights[1], settings.density, settings.area)
         vpl_sets[0] = _with_counts(lights, of_lights, vpls.on_lights, bound)
         vpl_sets[1] = _with_counts(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
     lights.order[i] = i
@@ -162,12 +180,12 @@ def _divide_into_sets(
         p = vpls.position[i]
         code = int(0)
         for k in range(3):
-            cell = wp.clamp(int((p[k] / extent + 0.5) * 64.0), 0, 63)
+            cell = wp.clamp(int((p[k] / settings.extent + 0.5) * 64.0), 0, 63)
             code = code | (_spread_bits(cell) << k)
         if i < vpls.on_lights:
             keys[i] = code | ((i // (of_lights[1] * _LANES)) << 18)
         else:
-            keys[i] = code | (((i - vpls.on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 24)
+            keys[i] = code | (((i - vpls.on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 30)
 
 
 @wp.kernel
@@ -203,6 +221,38 @@ def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
 
 
 @wp.kernel
+def _pack_slots(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs the rows of one VPL; those on lights come first."""
+    slot = first + wp.tid()
+    kind = int(ON_LIGHTS)
+    if slot >= vpl_sets[kind].count:
+        slot -= vpl_sets[kind].count
+        kind = int(ON_SURFACES)
+    group = vpl_sets[kind]
+    if slot >= group.count:
+        return
+    vpl = group.order[slot]
+    normal = group.vpls.normal[vpl]
+    mean_intensity = draw_weight(group, vpl, group.vpls.intensity[vpl])
+    group.slots[SLOT_ROWS * slot] = group.vpls.position[vpl]
+    group.slots[SLOT_ROWS * slot + 1] = normal
+    group.slots[SLOT_ROWS * slot + 2] = wp.vec4(mean_intensity, bound_of(group, vpl, normal), 0.0, 0.0)
+    group.intensity_bounce[slot] = intensity_and_bounce(group, slot)
+    if group.shaped == 1:
+        row = group.vpls.modifiers[vpl]
+        axis_end = wp.vec4(0.0, 0.0, 0.0, -2.0)
+        ramp = wp.vec4(0.0, 1.0, 1.0, 0.0)
+        if row >= 0:
+            modifiers = scene.light_tables[0].modifiers.rows[row]
+            axis_end = wp.vec4(
+                modifiers.frame[2, 0], modifiers.frame[2, 1], modifiers.frame[2, 2], modifiers.cutoff_cosine
+            )
+            ramp = wp.vec4(modifiers.ramp_slope, modifiers.ramp_offset, modifiers.ramp_min, 0.0)
+        group.slot_shaping[SLOT_SHAPING_ROWS * slot] = axis_end
+        group.slot_shaping[SLOT_SHAPING_ROWS * slot + 1] = ramp
+
+
+@wp.kernel
 def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
     """Packs the rows of shaping of block `i`."""
     i = first + wp.tid()
@@ -233,28 +283,37 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
     at once.
     """
     scene, launcher = guide.scene, scratch.launcher
-    packed = not launcher.device.is_cuda  # on CUDA a thread evaluates VPLs one by one, from the buffer
     # The radix sort needs twice the memory of its data.
     keys = scratch.array("sets.keys", max(2 * vpls.capacity, 1), wp.int32)
     order = scratch.array("sets.order", max(2 * vpls.capacity, 1), wp.int32)
     vpl_sets = scratch.array("sets", 2, VplSets)
+    slotted = launcher.wavefront or not launcher.lanes
+    settings = SetSettings()
+    settings.max_sets = MAX_SETS_OF_BLOCKS if launcher.lanes else MAX_SETS
+    settings.extent, settings.area, settings.density = scene.detail_extent, scene.area, guide.density_ratio
     lights, surfaces = VplSets(), VplSets()
     blocks = []
     for group, name, begin, end in (
         (lights, "lights", 0, vpls.on_lights),
         (surfaces, "surfaces", vpls.on_lights, vpls.capacity),
     ):
-        most = -(-(end - begin) // LANES) + _MAX_SETS - 1 if packed and end > begin else 0
+        most = -(-(end - begin) // LANES) + MAX_SETS_OF_BLOCKS - 1 if launcher.lanes and end > begin else 0
+        slots = end - begin if slotted else 0
         blocks.append(most)
         group.vpls, group.order = vpls, order[begin:] if end > begin else order
-        group.rows = scratch.array(f"sets.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
-        group.intensity_bounce = scratch.array(f"sets.{name}.intensity_bounce", max(LANES * most, 1), wp.vec4)
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
+        group.rows = scratch.array(f"sets.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
         group.shaping = scratch.array(f"sets.{name}.shaping", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
-    inputs = [lights, surfaces, scene.detail_extent, guide.density_ratio, scene.area, keys, vpl_sets]
+        group.slots = scratch.array(f"sets.{name}.slots", max(SLOT_ROWS * slots, 1), wp.vec4)
+        shaping_rows = max(SLOT_SHAPING_ROWS * slots * group.shaped, 1)
+        group.slot_shaping = scratch.array(f"sets.{name}.slot_shaping", shaping_rows, wp.vec4)
+        group.intensity_bounce = scratch.array(f"sets.{name}.intensity_bounce", max(LANES * most, slots, 1), wp.vec4)
+    inputs = [lights, surfaces, settings, keys, vpl_sets]
     launcher.launch(_divide_into_sets, max(vpls.capacity, 1), inputs)  # also without VPLs: counts must become 0
     wp.utils.radix_sort_pairs(keys, order, vpls.capacity)
     launcher.launch(_pack, sum(blocks), [vpl_sets])
     if lights.shaped:
         launcher.launch(_pack_shaping, blocks[0], [scene.data, vpl_sets])
+    if slotted:
+        launcher.launch(_pack_slots, vpls.capacity, [scene.data, vpl_sets])
     return vpl_sets

@@ -104,8 +104,8 @@ def trace_vpls(
         InputError: The scene, the settings or the device cannot be used, or there is no such pixel.
     """
     settings = settings or RenderSettings()
-    resolved = settings.resolve(scene.camera.aspect)
     launcher = Launcher(device)
+    resolved = settings.resolve(scene.camera.aspect, max_paths=launcher.max_light_paths())
     uploaded = upload_scene(scene, launcher)
     buffer, vpls = trace_uploaded(uploaded, Scratch(launcher), resolved, iteration)
     if contribution_to is None:
