@@ -15,6 +15,7 @@ threads, and films of different iterations can be merged.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import ModuleType
 
 import warp as wp
 
@@ -77,13 +78,12 @@ class Renderer:
         self._origin: Scene | None = None
         self._layout: _BufferLayout | None = None
         self._take_settings(scene)
-        estimator = ESTIMATORS[settings.estimator]
-        before = [*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *estimator.MODULES]
+        before = [*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *self._estimator_modules()]
         after = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
         with self.launcher.loading():
             self.launcher.expect([*before, *after])
             if self.launcher.wavefront:  # a GPU's code takes longest: all side by side, before the upload
-                self.launcher.load([*before, *estimator.WAVEFRONT_MODULES, *after])
+                self.launcher.load([*before, *after])
                 self._upload(scene)
             else:
                 self.launcher.load(before)  # what takes longest comes first
@@ -109,7 +109,7 @@ class Renderer:
             self._take_settings(scene, settings)
             with self.launcher.loading():
                 if self._resolved.estimator != before.estimator:
-                    self.launcher.load(ESTIMATORS[self._resolved.estimator].MODULES)
+                    self.launcher.load(self._estimator_modules())
                 if self._resolved.filter and not before.filter:
                     self.launcher.load(FILTER_MODULES)
                 self._upload(scene)
@@ -233,6 +233,11 @@ class Renderer:
             numbers = [stratum(iteration, shift) for iteration in range(SAMPLES)]
             shutter = [(state.scene, state.camera) for state in self._shutter]
             return measure_coverage(shutter, numbers, self.settings.seed, self.launcher)
+
+    def _estimator_modules(self) -> list[ModuleType]:
+        """The modules of kernels that the estimator needs on this device."""
+        estimator = ESTIMATORS[self._resolved.estimator]
+        return [*estimator.MODULES, *(estimator.WAVEFRONT_MODULES if self.launcher.wavefront else [])]
 
     def _take_settings(self, scene: Scene, settings: RenderSettings | None = None) -> None:
         """Fills in what depends on the scene's camera, and refuses pictures too large for the memory.
