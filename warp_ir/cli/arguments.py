@@ -117,6 +117,15 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Raises:
         InputError: The arguments are wrong.
     """
+    parser, _ = _parsers()
+    args, unknown = parser.parse_known_args(_join_aov_names(argv))
+    if unknown:  # argparse itself would name the help of all commands
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
+    return args
+
+
+def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """The parser of the command line, and those of the commands by name."""
     parser = _Parser(
         prog="warp-ir",
         description="Instant radiosity for USD scenes: diffuse global illumination on CPU and GPU.",
@@ -145,10 +154,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
         more = "print all warnings, and tracebacks of errors"
         messages.add_argument("--verbose", "-v", action="store_true", help=more)
-    args, unknown = parser.parse_known_args(_join_aov_names(argv))
-    if unknown:  # argparse itself would name the help of all commands
-        raise InputError(f"unrecognized arguments: {' '.join(unknown)} (see warp-ir {args.command} --help)")
-    return args
+    return parser, commands.choices
 
 
 def _join_aov_names(argv: Sequence[str]) -> list[str]:
