@@ -1,4 +1,4 @@
-"""What a user meets first: the README's commands and programs, imports that cost nothing, the project's files."""
+"""What a user meets first: the README's test command, imports that cost nothing, links, the project's files."""
 
 import os
 import re
@@ -37,17 +37,6 @@ def test_readme_test_command_runs_in_ci():
     assert os.access(script, os.X_OK)
 
 
-def test_readme_render_command_parses():
-    """The README's first command, and the others, are understood, and their scene exists."""
-    from warp_ir.cli.arguments import parse
-
-    commands = re.findall(r"warp-ir ((?:render|view|info|vpls|compare) [^`#\n]+)", README)
-    assert len(commands) >= 8
-    for command in commands:
-        parse(command.split())
-    assert (ROOT / "scenes_usd" / "cornell_box.usda").is_file()
-
-
 DOCUMENTS = sorted(
     str(path.relative_to(ROOT))
     for folder in (".", "docs", "docs/design", "benchmarks")
@@ -78,35 +67,9 @@ def test_decisions_are_held_by_what_exists(name):
 
 def test_pictures_are_small():
     """A clone stays light."""
-    pictures = [path for path in (ROOT / "docs").iterdir() if path.suffix != ".md"]
+    pictures = list((ROOT / "docs" / "pictures").iterdir())
     assert {"cornell_box.png", "vpls.png"} <= {path.name for path in pictures}
     assert [path.name for path in pictures if path.stat().st_size > 300_000] == []
-
-
-def test_readme_programs_run(tmp_path, monkeypatch):
-    """The Python of the README does what it says."""
-    programs = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len(programs) == 2
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scenes_usd").symlink_to(ROOT / "scenes_usd")
-    for program in programs:
-        program = program.replace("width=128, iterations=16", "width=8, iterations=2")
-        exec(compile(program, "README.md", "exec"), {})
-    assert (tmp_path / "cornell.exr").is_file()
-
-
-@pytest.mark.extended
-def test_api_examples_run(tmp_path, monkeypatch):
-    """The examples run one after the other, and there is one of every public name."""
-    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scenes_usd").symlink_to(ROOT / "scenes_usd")
-    names = {}
-    for program in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
-        exec(compile(program, "docs/api.md", "exec"), names)
-    assert sorted(re.findall(r"^### `(\w+)`$", text, flags=re.MULTILINE)) == warp_ir.__all__
-    for section in text.split("\n### ")[1:]:
-        assert f"ir.{section.split('`')[1]}" in section or section.startswith("`Film`")
 
 
 def test_import_is_light():
