@@ -1,6 +1,7 @@
 """VPLs in their scene: pictures, pages, models and animations, without a display."""
 
 import json
+import re
 import shutil
 import subprocess
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ import pytest
 
 from warp_ir import Camera, InputError, Mesh, Projection, RenderSettings, Scene, trace_vpls
 from warp_ir.image.io import read_image
-from warp_ir.preview import animate_vpls, picture_vpls, plotter, write_html, write_model
+from warp_ir.preview import animate_vpls, pick_vpls, picture_vpls, plotter, write_html, write_model
 from warp_ir.preview.plot import dot_colors
 from warp_ir.procedural import cornell_box
 
@@ -138,6 +139,34 @@ class TestOfTheCornellBox:
         lines = describe(vpls, 5).splitlines()
         assert lines[0].startswith(f"VPL 5, bounce {vpls.bounce[5]}, parent {vpls.parent[5]}")
         assert lines[-1].startswith("contribution ")
+
+    def test_a_right_click_picks_the_disc_under_the_pointer(self, vpls):
+        """Clicked where VPLs are, the window names a VPL that is there: that one, or one whose disc is before it."""
+        plot = plotter(self.SCENE, vpls, off_screen=True)
+        pick_vpls(plot, vpls)
+        plot.show(auto_close=False)
+
+        def place(k):
+            """Column and row of a VPL in the window [pixels]."""
+            plot.renderer.SetWorldPoint(*map(float, vpls.positions[k]), 1.0)
+            plot.renderer.WorldToDisplay()
+            return np.array(plot.renderer.GetDisplayPoint()[:2])
+
+        on_surfaces = np.flatnonzero(vpls.parent >= 0)[:24]
+        picked = {}
+        for k in on_surfaces:
+            column, row = np.round(place(k)).astype(int).tolist()
+            plot.remove_actor("vpl text", render=False)
+            plot.iren._mouse_right_button_press(column, row)
+            plot.iren._mouse_right_button_release(column, row)
+            if "vpl text" in plot.actors:
+                text = "".join(plot.actors["vpl text"].GetText(corner) or "" for corner in range(8))
+                picked[k] = int(re.match(r"VPL (\d+),", text)[1])
+        away = {k: float(np.linalg.norm(place(j) - place(k))) for k, j in picked.items()}
+        plot.close()
+        assert len(picked) > len(on_surfaces) // 4  # discs face the room: some are seen from behind or are hidden
+        assert sum(k == j for k, j in picked.items()) > len(picked) // 2
+        assert max(away.values()) < 40.0
 
     def test_a_model_has_the_colours(self, vpls, tmp_path):
         """The .gltf is complete in itself, and its meshes have vertex colours."""

@@ -24,6 +24,8 @@ _DECADES = 4.0
 _BACKGROUND = "#16181d"
 _PATH_COLOR, _LIGHT_COLOR, _CAMERA_COLOR = "#7fb2ff", "#ffd75f", "#9be28f"
 _RAY_COLOR = "#ff8f6b"
+_PICKED = 0.1
+"""Distance of what is seen at a pixel from the shape of a VPL, relative to its size, up to which it is that shape."""
 _RADIUS = 0.006
 """Radius of the disc of a VPL of median intensity, per extent of the scene."""
 
@@ -178,13 +180,34 @@ def describe(vpls: "Vpls", index: int) -> str:
 
 def pick_vpls(plot: "pyvista.Plotter", vpls: "Vpls") -> None:
     """Lets a right click, or the key P, on a VPL write its numbers into the window of a plotter."""
+    window: Any = plot
 
-    def show(cell: Any) -> None:
-        if cell is not None and "vpl" in cell.cell_data:
-            plot.add_text(describe(vpls, int(cell.cell_data["vpl"][0])), name="vpl text", font_size=9, color="white")
+    def pick() -> None:
+        index = _vpl_at(window, *window.iren.get_event_position())
+        if index is not None:
+            window.add_text(describe(vpls, index), name="vpl text", font_size=9, color="white")
 
-    picking: Any = plot
-    picking.enable_element_picking(callback=show, mode="cell", show_message=False, left_clicking=False)
+    window.iren.add_observer("RightButtonPressEvent", lambda *_: pick())
+    window.add_key_event("p", pick)
+
+
+def _vpl_at(plot: Any, column: int, row: int) -> int | None:
+    """Index of the VPL that is drawn at a pixel of a plotter's window (row 0 at the bottom); None: none.
+
+    What is drawn there decides by its depth: VTK's pickers also hit what is culled.
+    """
+    depth = plot.renderer.GetZ(column, row)
+    if depth >= 1.0 or "vpls" not in plot.actors:
+        return None
+    plot.renderer.SetDisplayPoint(column, row, depth)
+    plot.renderer.DisplayToWorld()
+    x, y, z, w = plot.renderer.GetWorldPoint()
+    seen = np.array([x, y, z]) / w
+    shapes = plot.actors["vpls"].mapper.dataset
+    cell, closest = shapes.find_closest_cell(seen, return_closest_point=True)
+    size = np.linalg.norm(np.ptp(shapes.get_cell(cell).points, axis=0))
+    on_it = np.linalg.norm(closest - seen) < _PICKED * size
+    return int(shapes.cell_data["vpl"][cell]) if on_it else None
 
 
 def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
