@@ -339,6 +339,24 @@ def test_a_motion_interrupts_the_work_on_a_resting_picture():
     assert cancelled and frame.state.max_bounces == 0 and frame.pixels.any()
 
 
+def test_another_exposure_interrupts_an_iteration_and_keeps_the_film():
+    """It shows at once, with the iterations that the film has; that which was interrupted is done again."""
+    view = view_of(width=320, height=180, iterations=1000)
+    next_frame(view)
+    time.sleep(0.2)
+    while view._film is None or view._film.width < 320:
+        view.step()
+    film = view._film
+    brighten = threading.Timer(0.02, lambda: view.change(exposure=1.0))
+    brighten.start()
+    while view.state.exposure == 0.0:
+        done = film.iterations
+        view.step()
+    brighten.join()
+    frame = next_frame(view)
+    assert frame.state.exposure == 1.0 and view._film is film and frame.iterations in (done, done + 1)
+
+
 def test_display_changes_render_nothing():
     """Exposure and tone curve map the same radiance: brighter, and without another iteration."""
     view = view_of(iterations=4)

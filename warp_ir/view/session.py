@@ -224,7 +224,7 @@ class LiveView:
     # What a user interface calls
 
     def change(self, **values: object) -> None:
-        """Changes fields of the state. Work on a picture that these make obsolete is interrupted."""
+        """Changes fields of the state. Work on a resting picture is interrupted, so that what is new shows at once."""
         with self._lock:
             self._change(**values)
 
@@ -232,8 +232,8 @@ class LiveView:
         before, self.state = self.state, replace(self.state, **values)  # type: ignore[arg-type]
         if not _same(before, self.state, _RENDERED):
             self._changed_at = time.perf_counter()
-            if self._cancellable:
-                self._renderer.launcher.cancel()
+        if self._cancellable:  # an iteration may take seconds, and another exposure shall show at once
+            self._renderer.launcher.cancel()
         self.changed.notify_all()
 
     def navigate(self, control: Callable[[Camera], Camera]) -> None:
@@ -591,7 +591,7 @@ class LiveView:
 
     @contextmanager
     def _interruptible(self, state: ViewState) -> Iterator[None]:
-        """A change of what is rendered cancels the launches inside, which raise `Cancelled`."""
+        """A change of the state cancels the launches inside, which raise `Cancelled`."""
         with self._lock:
             if self._closed or not _same(self.state, state, _RENDERED):
                 raise Cancelled
