@@ -173,6 +173,16 @@ def test_a_film_has_its_own_time():
     assert renderer.render().iterations == 4
 
 
+def test_progress_has_the_picture_so_far():
+    """The callback after iteration n sees the mean of n iterations; the last picture is that of the film."""
+    pictures = []
+    settings = ir.RenderSettings(width=8, height=8, iterations=3, light_paths=16, filter=False)
+    film = ir.render(cornell_box(), settings, progress=lambda p: pictures.append(p.film.radiance().copy()))
+    assert len(pictures) == 3 and np.array_equal(pictures[2], film.radiance())
+    first = ir.render(cornell_box(), replace(settings, iterations=1)).radiance()
+    assert np.array_equal(pictures[0], first) and not np.array_equal(pictures[0], pictures[1])
+
+
 def test_cancelled_films_hold_whole_iterations(monkeypatch):
     """`cancel` while an iteration is being added waits until it is: no pixel has it without the others."""
     settings = ir.RenderSettings(width=32, height=32, light_paths=64)

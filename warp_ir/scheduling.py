@@ -7,7 +7,7 @@ the others have one as small. If the time left is too short for all the tiles of
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,8 @@ class Progress:
     """Fraction of the nearest limit that is used up, 0 to 1."""
     seconds_left: float
     """Estimated remaining time [s]; NaN if unknown."""
+    film: Film = field(repr=False)
+    """The film, whose `radiance()` is the picture so far; filtering it takes a part of an iteration's time."""
 
 
 class AdaptiveScheduler:
@@ -99,7 +101,7 @@ class AdaptiveScheduler:
             shares.append(1.0)
         fraction = min(max(shares), 1.0)
         left = film.seconds * (1.0 / fraction - 1.0) if fraction > 0.0 else math.nan
-        return Progress(film.iterations, film.seconds, error, fraction, left)
+        return Progress(film.iterations, film.seconds, error, fraction, left, film)
 
 
 def select_tiles(squares: Floats, iterations: npt.NDArray[np.int32], max_tiles: float = math.inf) -> Mask:
