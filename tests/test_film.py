@@ -135,7 +135,8 @@ def test_values_that_are_not_finite_stay_out(device):
     bad = np.full((96, 3), 1.0, np.float32)
     bad[5], bad[6, 1] = np.inf, np.nan
     renderer._gbuffer.normal_or_direct.assign(bad)
-    film.add(renderer._gbuffer)
+    film.accumulate(renderer._gbuffer)
+    film.count_iteration()
     assert film.rejected == 2
     image = film.radiance().reshape(-1, 3)
     np.testing.assert_array_equal(image[[5, 6]], 0.5)
@@ -159,7 +160,8 @@ def test_long_renders_do_not_drift(device):
     film = renderer.new_film()
     for sample in samples:
         renderer._gbuffer.normal_or_direct.assign(sample)
-        film.add(renderer._gbuffer)
+        film.accumulate(renderer._gbuffer)
+        film.count_iteration()
     mean, error = film.radiance().reshape(96, 3), film.standard_error().reshape(96, 3)
     expected = samples.mean(axis=0, dtype=np.float64), samples.std(axis=0, ddof=1, dtype=np.float64) / math.sqrt(n)
     np.testing.assert_allclose(mean, expected[0], rtol=6.0 * 2.0**-25 * math.sqrt(n / 6.0))
@@ -192,8 +194,8 @@ def test_cancelled_films_hold_whole_iterations(monkeypatch):
         film = renderer.new_film()
         renderer.add_iteration(film, 0)
         if cancels:
-            add = film.add
-            monkeypatch.setattr(film, "add", lambda *rows, add=add, r=renderer: (r.launcher.cancel(), add(*rows)))
+            add, cancel = film.accumulate, renderer.launcher.cancel
+            monkeypatch.setattr(film, "accumulate", lambda *rows, add=add, cancel=cancel: (cancel(), add(*rows)))
         renderer.add_iteration(film, 1)
         renderer.launcher.resume()
         films.append(film)

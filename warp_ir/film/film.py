@@ -144,22 +144,17 @@ class Film:
         """Number of iterations of every tile of 8 x 8 pixels, [tiles], row by row."""
         return self.iterations - self._skipped
 
-    def add(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
-        """Adds one iteration: a G-buffer that an estimator has filled, multiplied by `exposure`.
+    def accumulate(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
+        """Adds one iteration on the device: a G-buffer that an estimator has filled, multiplied by `exposure`.
 
         With motion blur, `shutter_sample` is the number of the shutter sample that it was made at.
         """
-        self.accumulate(gbuffer, exposure, shutter_sample)
-        self.count_iteration()
-
-    def accumulate(self, gbuffer: GBuffer, exposure: float = 1.0, shutter_sample: int = 0) -> None:
-        """Does the part of `add` that happens on the device."""
         add_samples(gbuffer, exposure, self._sees_dome, self._data, self._launcher)
         if self.reconstruction is not None:
             self.reconstruction.accumulate(gbuffer, shutter_sample)
 
     def count_iteration(self) -> None:
-        """Does the part of `add` that happens on the host."""
+        """Counts, on the host, an iteration that `accumulate` has added: a CUDA graph repeats that alone."""
         self.iterations += 1
         if not self.chosen.all():
             self._skipped += ~self.chosen
