@@ -168,6 +168,26 @@ class TestOfTheCornellBox:
         assert sum(k == j for k, j in picked.items()) > len(picked) // 2
         assert max(away.values()) < 40.0
 
+    def test_a_right_click_on_a_surface_asks_the_pixel_that_shows_it(self):
+        """The shadow rays that are drawn begin where was clicked, to the size of a pixel, at VPLs that light it."""
+        settings = RenderSettings(width=64, height=64, light_paths=64)
+        vpls = trace_vpls(self.SCENE, settings)
+        plot = plotter(self.SCENE, vpls, view="camera", width=256, off_screen=True)
+        pick_vpls(plot, vpls, self.SCENE, settings)
+        plot.show(auto_close=False)
+        column, row = 100, 90  # of the window, from its lower left corner: the floor before the boxes, or a box
+        plot.iren._mouse_right_button_press(column, row)
+        plot.iren._mouse_right_button_release(column, row)
+        text = "".join(plot.actors["vpl text"].GetText(corner) or "" for corner in range(8))
+        rays = plot.actors["shadow rays"].mapper.dataset
+        start = rays.points[0]
+        plot.renderer.SetWorldPoint(*map(float, start), 1.0)
+        plot.renderer.WorldToDisplay()
+        seen = np.array(plot.renderer.GetDisplayPoint()[:2])
+        plot.close()
+        assert text == f"pixel {column // 4} {63 - row // 4}"
+        assert rays.n_cells > 5 and np.abs(seen - (column, row)).max() <= 4.0
+
     def test_a_model_has_the_colours(self, vpls, tmp_path):
         """The .gltf is complete in itself, and its meshes have vertex colours."""
         plot = plotter(self.SCENE, vpls, off_screen=True)

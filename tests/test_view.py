@@ -47,7 +47,7 @@ def test_orbit_keeps_distance_and_aim(right, upwards):
     turned = navigation.orbit(EYE, pivot, UP, right, upwards)
     assert rigid(turned)
     assert np.linalg.norm(place(turned) - pivot) == pytest.approx(4.0)
-    column, row, depth = navigation.project(turned, pivot[None])
+    column, row, depth = turned.project(pivot[None])
     assert (column[0], row[0], depth[0]) == pytest.approx((0.5, 0.5, 4.0))
     assert abs(turned.world_from_camera[1, 0]) < 1e-9  # its horizon is level
     assert turned.world_from_camera[1, 1] > 0.0  # it never goes over the pole
@@ -72,8 +72,8 @@ def test_pan_takes_the_pivot_along(projection):
     """Panning by a tenth of the picture's height shifts the pivot by that in the picture."""
     camera = replace(EYE, projection=projection)
     pivot = np.array([0.3, 1.2, 0.0])
-    before = navigation.project(camera, pivot[None])
-    after = navigation.project(navigation.pan(camera, pivot, -0.1, 0.0), pivot[None])
+    before = camera.project(pivot[None])
+    after = navigation.pan(camera, pivot, -0.1, 0.0).project(pivot[None])
     assert after[0][0] - before[0][0] == pytest.approx(0.1 / 1.5) and after[1][0] == pytest.approx(before[1][0])
 
 
@@ -84,9 +84,7 @@ def test_dolly_enlarges_by_its_factor(projection):
     pivot = np.array([0.0, 1.0, 0.0])
     near = navigation.dolly(camera, pivot, 0.5)
     points = pivot + np.array([[-0.1, 0, 0], [0.1, 0, 0]])
-    assert np.diff(navigation.project(near, points)[0]) == pytest.approx(
-        2 * np.diff(navigation.project(camera, points)[0])
-    )
+    assert np.diff(near.project(points)[0]) == pytest.approx(2 * np.diff(camera.project(points)[0]))
 
 
 def test_walking_stays_on_the_ground():
@@ -104,7 +102,7 @@ def test_framed_shows_the_whole_box(projection):
     camera = replace(Camera.look_at((5, 9, 4), (0, 1, 0), aspect=1.5), projection=projection)
     corners = np.array(np.meshgrid([0, 2], [0, 3], [0, 1.0])).reshape(3, -1).T
     shown = navigation.framed(camera, corners.min(axis=0), corners.max(axis=0))
-    column, row, depth = navigation.project(shown, corners)
+    column, row, depth = shown.project(corners)
     assert (depth > 0).all() and np.min([column, row]) > 0.0 and np.max([column, row]) < 1.0
     assert (shown.world_from_camera[:3, :3] == camera.world_from_camera[:3, :3]).all()
 

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from warp_ir.preview.shapes import camera_lines, light_outlines, lines_to, path_lines, vpl_shapes
 from warp_ir.preview.surfaces import add_surfaces
-from warp_ir.scene import Camera, InputError, Projection, Scene
+from warp_ir.scene import Camera, Floats, InputError, Projection, Scene
+from warp_ir.settings import RenderSettings
 
 if TYPE_CHECKING:
     import pyvista
@@ -161,6 +162,7 @@ def _add_paths(plot: Any, vpls: "Vpls", shown: npt.NDArray[np.intp], size: float
     if vpls.pixel_position is not None and vpls.contribution is not None:
         lit = shown[_contribution(vpls)[shown] > 0.0]
         rays = lines_to(vpls.pixel_position, np.asarray(vpls.positions)[lit], vpls.directional[lit], size)
+        plot.remove_actor("shadow rays")
         if rays.n_cells:
             plot.add_mesh(rays, color=_RAY_COLOR, opacity=0.5, line_width=1, lighting=False, name="shadow rays")
 
@@ -178,36 +180,90 @@ def describe(vpls: "Vpls", index: int) -> str:
     return "\n".join(lines)
 
 
-def pick_vpls(plot: "pyvista.Plotter", vpls: "Vpls") -> None:
-    """Lets a right click, or the key P, on a VPL write its numbers into the window of a plotter."""
+def pick_vpls(
+    plot: "pyvista.Plotter", vpls: "Vpls", scene: Scene | None = None, settings: RenderSettings | None = None
+) -> None:
+    """Lets a right click, or the key P, ask the window of a plotter.
+
+    On a VPL, its numbers are written into the window. On a surface, the pixel in which the scene's camera sees that
+    place is asked for, if a scene is given: the VPLs take the colours of what they contribute to it, and lines lead to
+    those that are visible from there.
+
+    Args:
+        plot: The plotter of these VPLs, from `plotter`.
+        vpls: The VPLs.
+        scene: The scene in which they were traced.
+        settings: The settings with which they were traced, and the image of which a pixel is meant.
+    """
     window: Any = plot
+    shown = vpls
 
     def pick() -> None:
-        index = _vpl_at(window, *window.iren.get_event_position())
+        nonlocal shown
+        place = _seen_at(window, *window.iren.get_event_position())
+        if place is None:
+            return
+        index = _vpl_at(window, place)
         if index is not None:
-            window.add_text(describe(vpls, index), name="vpl text", font_size=9, color="white")
+            text = describe(shown, index)
+        elif scene is not None:
+            pixel = _pixel_of(scene, settings or RenderSettings(), place)
+            text = f"pixel {pixel[0]} {pixel[1]}" if pixel else "not in the camera's picture"
+            if pixel:
+                shown = _show_contributions(window, scene, settings, pixel)
+        else:
+            return
+        window.add_text(text, name="vpl text", font_size=9, color="white")
 
     window.iren.add_observer("RightButtonPressEvent", lambda *_: pick())
     window.add_key_event("p", pick)
 
 
-def _vpl_at(plot: Any, column: int, row: int) -> int | None:
-    """Index of the VPL that is drawn at a pixel of a plotter's window (row 0 at the bottom); None: none.
+def _show_contributions(plot: Any, scene: Scene, settings: RenderSettings | None, pixel: tuple[int, int]) -> "Vpls":
+    """Traces the VPLs with what they contribute to a pixel, and draws them by it, with the unoccluded shadow rays."""
+    from warp_ir.vpl.trace import trace_vpls  # imports Warp
 
-    What is drawn there decides by its depth: VTK's pickers also hit what is culled.
+    vpls = trace_vpls(scene, settings, contribution_to=pixel)
+    every, size = np.arange(len(vpls.positions)), scene.extent or 1.0
+    add_vpls(plot, vpls, every, "contribution", size)
+    _add_paths(plot, vpls, every, size)
+    return vpls
+
+
+def _seen_at(plot: Any, column: int, row: int) -> Floats | None:
+    """The place [3] that is drawn at a pixel of a plotter's window (row 0 at the bottom); None: the background.
+
+    The depth that is drawn there decides: VTK's pickers also hit what is culled.
     """
     depth = plot.renderer.GetZ(column, row)
-    if depth >= 1.0 or "vpls" not in plot.actors:
+    if depth >= 1.0:
         return None
     plot.renderer.SetDisplayPoint(column, row, depth)
     plot.renderer.DisplayToWorld()
     x, y, z, w = plot.renderer.GetWorldPoint()
-    seen = np.array([x, y, z]) / w
+    place: Floats = np.array([x, y, z]) / w
+    return place
+
+
+def _vpl_at(plot: Any, place: Floats) -> int | None:
+    """Index of the VPL on whose shape a place is; None: none."""
+    if "vpls" not in plot.actors:
+        return None
     shapes = plot.actors["vpls"].mapper.dataset
-    cell, closest = shapes.find_closest_cell(seen, return_closest_point=True)
+    cell, closest = shapes.find_closest_cell(place, return_closest_point=True)
     size = np.linalg.norm(np.ptp(shapes.get_cell(cell).points, axis=0))
-    on_it = np.linalg.norm(closest - seen) < _PICKED * size
+    on_it = np.linalg.norm(closest - place) < _PICKED * size
     return int(shapes.cell_data["vpl"][cell]) if on_it else None
+
+
+def _pixel_of(scene: Scene, settings: RenderSettings, place: Floats) -> tuple[int, int] | None:
+    """Column and row of the pixel of an image of these settings that shows a place; None: none does."""
+    height = settings.resolve(scene.camera.aspect).height
+    camera = scene.camera.fit(settings.width, height, settings.conform, settings.pixel_aspect)
+    (column,), (row,), (depth,) = camera.project(place[None])
+    if not (depth > 0.0 and 0.0 <= column < 1.0 and 0.0 <= row < 1.0):
+        return None
+    return int(column * settings.width), int(row * height)
 
 
 def dot_colors(intensity: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:

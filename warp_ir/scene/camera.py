@@ -85,6 +85,22 @@ class Camera:
         y, half_y = 0.5 * (bottom + top), 0.5 * (top - bottom) * scale_y
         return replace(self, window=(x - half_x, x + half_x, y - half_y, y + half_y))
 
+    def project(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Where a picture of the window's aspect shows points [n, 3]; `fit` gives a camera that aspect.
+
+        Returns:
+            Columns and rows as fractions of the picture, from its upper left corner, and depths along the view in
+            scene units, [n] each; behind the camera the depth is negative.
+        """
+        left, right, bottom, top = self.window
+        local = (np.asarray(points, np.float64) - self.world_from_camera[:3, 3]) @ self.world_from_camera[:3, :3]
+        depth = -local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1.0 / depth if self.projection == Projection.PERSPECTIVE else np.ones(len(depth))
+            column = (local[:, 0] * scale - left) / (right - left)
+            row = (top - local[:, 1] * scale) / (top - bottom)
+        return column, row, depth
+
     @staticmethod
     def look_at(
         eye: Sequence[float],

@@ -8,7 +8,6 @@ import numpy.typing as npt
 from warp_ir.image.tonemap import tone_map
 from warp_ir.preview.plot import dot_colors
 from warp_ir.scene import Camera, Floats
-from warp_ir.view.navigation import project
 from warp_ir.vpl.trace import Vpls
 
 Pixels = npt.NDArray[np.uint8]
@@ -59,7 +58,7 @@ def visible_vpls(
     Returns:
         Columns and rows as fractions of the picture [n], and indices of the VPLs [n], the farthest first.
     """
-    column, row, z = project(camera, vpls.positions)
+    column, row, z = camera.project(vpls.positions)
     inside = (column >= 0.0) & (column < 1.0) & (row >= 0.0) & (row < 1.0) & (z > 0.0) & ~vpls.directional
     index = np.flatnonzero(inside)
     height, width = depth.shape

@@ -93,22 +93,6 @@ def centre_at(camera: Camera, depth: float) -> Floats:
     return np.asarray(matrix[:3, 3] + matrix[:3, :3] @ (x * scale, y * scale, -depth))
 
 
-def project(camera: Camera, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where a camera, whose window has the aspect of the picture, sees points [n, 3].
-
-    Returns:
-        Columns and rows as fractions of the picture, from its upper left corner, and depths, [n] each.
-    """
-    left, right, bottom, top = camera.window
-    local = (np.asarray(points, np.float64) - camera.world_from_camera[:3, 3]) @ camera.world_from_camera[:3, :3]
-    depth = -local[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / depth if camera.projection == Projection.PERSPECTIVE else np.ones(len(depth))
-        column = (local[:, 0] * scale - left) / (right - left)
-        row = (top - local[:, 1] * scale) / (top - bottom)
-    return column, row, depth
-
-
 def _depth(camera: Camera, point: Floats) -> float:
     return float((camera.world_from_camera[:3, 3] - point) @ camera.world_from_camera[:3, 2])
 
