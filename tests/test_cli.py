@@ -948,7 +948,7 @@ def test_command_line_wins_over_the_settings_file(tmp_path):
     ],
 )
 def test_settings_file_errors_name_the_file(tmp_path, capsys, text, message):
-    """What is wrong with a settings file is said in one line, with its name and the key."""
+    """An error in a settings file is one line, which names the file and the key."""
     path = preset(tmp_path, text)
     assert f"{path}: {message}" in error_of(capsys, "render", ROOM, "a.exr", "--settings", path)
 

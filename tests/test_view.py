@@ -54,7 +54,7 @@ def test_orbit_keeps_distance_and_aim(right, upwards):
 
 
 def test_dragging_right_moves_the_scene_right():
-    """What is nearer than the pivot follows the pointer: the camera goes to the left, and down if dragged upwards."""
+    """Surfaces nearer than the pivot follow the pointer: the camera goes to the left, and down if dragged upwards."""
     turned = navigation.orbit(EYE, np.array([0.0, 1.0, 0.0]), UP, 0.2, 0.2)
     assert place(turned)[0] < 0.0 and place(turned)[1] < 1.0
 
@@ -286,6 +286,16 @@ def next_frame(view, seconds=20.0):
     raise AssertionError("no frame")
 
 
+def resting_view():
+    """A view whose film has the resolution of its window, and is far from converged."""
+    view = view_of(width=320, height=180, iterations=1000)
+    next_frame(view)
+    time.sleep(0.2)
+    while view._film is None or view._film.width < 320:
+        view.step()
+    return view
+
+
 def settle(view, seconds=60.0):
     end = time.perf_counter() + seconds
     while time.perf_counter() < end:
@@ -320,11 +330,7 @@ def test_motion_is_coarse_and_never_blank():
 @pytest.mark.extended
 def test_a_motion_interrupts_the_work_on_a_resting_picture():
     """A change during an iteration cancels it: the step ends without a frame, and the next shows the change."""
-    view = view_of(width=320, height=180, iterations=1000)
-    next_frame(view)
-    time.sleep(0.2)
-    while view._film is None or view._film.width < 320:
-        view.step()
+    view = resting_view()
     moving = threading.Timer(0.02, lambda: view.change(max_bounces=0))
     launcher = view._renderer.launcher
     cancelled = []
@@ -337,13 +343,10 @@ def test_a_motion_interrupts_the_work_on_a_resting_picture():
     assert cancelled and frame.state.max_bounces == 0 and frame.pixels.any()
 
 
+@pytest.mark.extended
 def test_another_exposure_interrupts_an_iteration_and_keeps_the_film():
     """It shows at once, with the iterations that the film has; that which was interrupted is done again."""
-    view = view_of(width=320, height=180, iterations=1000)
-    next_frame(view)
-    time.sleep(0.2)
-    while view._film is None or view._film.width < 320:
-        view.step()
+    view = resting_view()
     film = view._film
     brighten = threading.Timer(0.02, lambda: view.change(exposure=1.0))
     brighten.start()

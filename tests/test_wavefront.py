@@ -67,7 +67,7 @@ def test_the_picture_is_the_same(scene, settings, monkeypatch):
 
 @pytest.mark.parametrize("how", ["short waves", "no order"])
 def test_the_order_of_threads_changes_no_bit(how, monkeypatch):
-    """Which thread computes a pixel, and in which wave, is nothing that its light depends on."""
+    """The light of a pixel does not depend on the thread and the wave that compute it."""
     expected = in_waves(shaped())[0].radiance()
     if how == "no order":
         monkeypatch.setattr(wavefront, "_KEY_BITS", 0)

@@ -224,7 +224,7 @@ class Renderer:
         return film
 
     def cryptomattes(self) -> tuple[Cryptomatte, Cryptomatte]:
-        """Which objects, by the names of their meshes, and which materials cover each pixel, and how much of it.
+        """The objects, by the names of their meshes, and the materials that cover each pixel, and how much of it.
 
         Counted by the camera rays of the first 64 iterations, which are traced for it, however many a film has.
         """

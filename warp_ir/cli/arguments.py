@@ -339,9 +339,7 @@ def settings_of(args: argparse.Namespace, stage: Mapping[str, Any] | None = None
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("output", metavar="OUTPUT", help=_OUTPUT)
-    picture = parser.add_argument_group("picture")
-    _add_settings(picture, _FIELDS)
-    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height together")
+    picture = _add_picture(parser, _FIELDS)
     # The names of usdrecord are accepted, but not listed in the help.
     hidden = argparse.SUPPRESS
     suppressed: dict[str, Any] = {"default": hidden, "help": hidden}
@@ -397,14 +395,19 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
     _add_device(output)
-    threads = "CPU threads (default: one for each core); the picture does not depend on it"
-    output.add_argument("--threads", type=_count, metavar="N", help=threads)
+    _add_threads(output)
+
+
+def _add_picture(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse._ArgumentGroup:
+    """The group of flags for the picture: those of the settings that are named, and its size."""
+    picture = parser.add_argument_group("picture")
+    _add_settings(picture, names)
+    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height together")
+    return picture
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:
-    picture = parser.add_argument_group("picture")
-    _add_settings(picture, [name for name in _FIELDS if name not in _NOT_IN_VIEW])
-    picture.add_argument("--res", nargs=2, type=int, metavar=("W", "H"), help="width and height together")
+    picture = _add_picture(parser, [name for name in _FIELDS if name not in _NOT_IN_VIEW])
     stops = "exposure: each stop doubles the radiance (default: 0, or more or less where that would show nothing)"
     picture.add_argument("--exposure", type=_stops, metavar="STOPS", help=stops)
     curve = "tone curve: srgb clips highlights, filmic compresses them smoothly (default: srgb)"
@@ -418,8 +421,7 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
     layer = "file that F3 saves camera, lights and colours to (default: view_edits.usda)"
     output.add_argument("--edits", default="view_edits.usda", metavar="FILE", help=layer)
     _add_device(output)
-    threads = "CPU threads (default: one for each core); the picture does not depend on it"
-    output.add_argument("--threads", type=_count, metavar="N", help=threads)
+    _add_threads(output)
 
 
 def _add_info(parser: argparse.ArgumentParser) -> None:
@@ -582,6 +584,11 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
 def _add_device(group: argparse._ArgumentGroup) -> None:
     devices = "cpu, cuda:0, ... (default: auto, the first GPU, or the CPU if there is none)"
     group.add_argument("--device", default="auto", metavar="NAME", help=devices)
+
+
+def _add_threads(group: argparse._ArgumentGroup) -> None:
+    threads = "CPU threads (default: one for each core); the picture does not depend on it"
+    group.add_argument("--threads", type=_count, metavar="N", help=threads)
 
 
 def _flag(name: str) -> str:

@@ -24,7 +24,7 @@ class Estimator(Protocol):
     MODULES: ClassVar[Sequence[ModuleType]]
     """Modules with the kernels that it launches, those that take longest to compile first."""
     WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]]
-    """Those that it needs besides where `Launcher.wavefront` is true; others are loaded when a scene needs them."""
+    """Further modules where `Launcher.wavefront` is true; others are loaded when a scene needs them."""
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a camera and settings; what an iteration overwrites lies in `scratch`."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _SHARE = 0.1
 """Largest fraction of a render's time that goes into showing it."""
 _FIRST_SIZE = 640, 360
-"""Of the window until there is a picture."""
+"""Size of the window until there is a picture [pixels]."""
 _SECONDS = 0.2
 """Shortest time between two pictures [s]."""
 

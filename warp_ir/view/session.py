@@ -298,7 +298,7 @@ class LiveView:
         return centre_at(self._fitted(self.state), depth)
 
     def surface(self, column: float, row: float) -> tuple[str, Color] | None:
-        """What is seen at a place of the picture, in fractions of it: the name of its colour, and the colour.
+        """The surface that a place of the picture shows, in fractions of it: the name of its colour, and the colour.
 
         None: no surface.
         """

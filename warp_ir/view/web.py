@@ -19,7 +19,7 @@ from warp_ir.view.display import Pixels
 from warp_ir.view.session import Frame, LiveView
 
 _QUALITY = 90
-"""Of JPEG pictures."""
+"""Quality of the JPEG pictures that are sent, 0 to 100."""
 _TICK_SECONDS = 0.02
 _TOKEN_BYTES = 18
 _KEYS = {f"Arrow{name}": name for name in ("Left", "Right", "Up", "Down")}
