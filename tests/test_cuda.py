@@ -130,7 +130,7 @@ def resources(cubin):
 def test_drawn_vpls_have_room():
     """A thread without lanes keeps the VPLs that it has drawn in an array of eight."""
     how = warp_ir.estimators.vpl
-    assert max(*how._SHADOW_RAYS, *how._COMPENSATION_SHADOW_RAYS) <= warp_ir.vpl.gather.MAX_RAYS
+    assert max(*how.SHADOW_RAYS, *how.COMPENSATION_SHADOW_RAYS) <= warp_ir.vpl.gather.MAX_RAYS
 
 
 READS = ("numpy", "list", "to", "cptr", "__array_interface__", "__dlpack__", "__str__")

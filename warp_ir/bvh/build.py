@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ir.bvh.node_layout import BVH_WIDTH, INFINITY, Bvh, Instance, InstanceTree, vec8, vec8i
+from warp_ir.bvh.node_layout import BVH_WIDTH, INFINITY, NO_TREE, Bvh, Instance, InstanceTree, vec8, vec8i
 from warp_ir.bvh.warp_bvh import box_corner, child_or_range, is_leaf, node_count, primitive_at, root_node, tree_of_mesh
 from warp_ir.device.launcher import Launcher
 
@@ -180,7 +180,7 @@ def build_instance_tree(
     boxes = wp.Bvh(*corners, constructor="sah", leaf_size=1)
     out.instances = launcher.array(instances, Instance)
     if launcher.device.is_cuda:
-        out.bvh = boxes.id
+        out.bvh, out.bvh_roots = boxes.id, wp.vec2i(-1, NO_TREE)
         out.nodes, out.children = launcher.zeros(1, vec8), launcher.zeros(1, vec8i)
         out.leaf_instances, out.continues = launcher.zeros(1, wp.int32), launcher.zeros(1, wp.int32)
         return out, boxes

@@ -108,6 +108,27 @@ class BvhForest:
             refit_tree(self._bvh, tree.nodes, tree.blocks, points, indices, row_offset, self._launcher)
         return self._current_cost(tree) <= MAX_COST_RATIO * tree.built_cost
 
+    def refit_boxes(
+        self,
+        number: int,
+        points: wp.array[wp.vec3],
+        indices: wp.array[wp.int32],
+        point_rows: range,
+        first_triangle: int,
+    ) -> None:
+        """As `refit`, by launches alone: nothing is allocated, measured or read back."""
+        tree = self._trees[number]
+        if tree.mesh is not None:
+            wp.copy(tree.mesh.points, points[point_rows.start : point_rows.stop])
+            tree.mesh.refit()
+        else:
+            row_offset = first_triangle - tree.triangle_offset
+            refit_tree(self._bvh, tree.nodes, tree.blocks, points, indices, row_offset, self._launcher)
+
+    def root_node(self, number: int) -> int:
+        """The node of the wide tables at which a tree begins; -1 on CUDA."""
+        return -1 if self._trees[number].mesh is not None else self._trees[number].nodes.start
+
     def root(self, number: int) -> int:
         """The value of `Instance.root` for a prototype with this tree."""
         return number if self._trees[number].mesh is not None else self._trees[number].nodes.start

@@ -7,7 +7,7 @@ watertight across the edges of adjacent instances as well.
 import warp as wp
 
 from warp_ir.bvh.intersect8 import on_cuda, safe_reciprocal, traversal_source
-from warp_ir.bvh.node_layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel
+from warp_ir.bvh.node_layout import NO_TREE, Bvh, Instance, InstanceTree, RayHit, TwoLevel
 from warp_ir.bvh.warp_bvh import intersect_mesh
 
 wp.set_module_options({"enable_backward": False})
@@ -116,7 +116,7 @@ def _local_ray(instance: Instance, origin: wp.vec3, direction: wp.vec3) -> wp.ma
 #if !defined(__CUDA_ARCH__)
     {traversal_source(padded=True)}
     {_LOCAL_RAY}
-    traverse(tree, 0, make_ray(origin, direction, wp::vec3(0.0f)), hit.t, [&](int first_row) {{
+    traverse(tree, tree.root, make_ray(origin, direction, wp::vec3(0.0f)), hit.t, [&](int first_row) {{
         for (int row = first_row;; ++row) {{
             const int number = tree.leaf_instances.data[row];
             const auto& instance = tree.instances.data[number];
@@ -164,18 +164,21 @@ def intersect_instances(
     hit.t = t_max
     number = int(0)
     if on_cuda():
-        query = wp.bvh_query_ray(tree.bvh, origin, direction)
-        while wp.bvh_query_next(query, number, hit.t):
-            instance = tree.instances[number]
-            local = _local_ray(instance, origin, direction)
-            mesh = bvh.meshes[instance.root].mesh
-            candidate = traverse_mesh(mesh, local[0], local[1], hit.t, any_hit, local[2])
-            if candidate.triangle >= 0:
-                hit = candidate
-                hit.triangle += instance.triangle_offset
-                hit.instance = number
-                if any_hit:
-                    return hit
+        roots = int(2)  # not a constant: the loop would be unrolled
+        for k in range(roots):
+            if tree.bvh_roots[k] != NO_TREE:
+                query = wp.bvh_query_ray(tree.bvh, origin, direction, tree.bvh_roots[k])
+                while wp.bvh_query_next(query, number, hit.t):
+                    instance = tree.instances[number]
+                    local = _local_ray(instance, origin, direction)
+                    mesh = bvh.meshes[instance.root].mesh
+                    candidate = traverse_mesh(mesh, local[0], local[1], hit.t, any_hit, local[2])
+                    if candidate.triangle >= 0:
+                        hit = candidate
+                        hit.triangle += instance.triangle_offset
+                        hit.instance = number
+                        if any_hit:
+                            return hit
         return hit
     _intersect_instances_cpu(bvh, tree, origin, direction, any_hit, hit)
     return hit

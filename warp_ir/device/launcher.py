@@ -168,7 +168,7 @@ class Launcher:
             return
         self._wait_for(kernel.module)
         self._modules.load(kernel.module)
-        if self.device.is_cuda or self._recording:
+        if self.device.is_cuda or self._recording or self.device.is_capturing:
             wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
             return
         launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)

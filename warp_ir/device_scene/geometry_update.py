@@ -108,6 +108,24 @@ class DeviceGeometry:
         data.two_level = launcher.array([two_level], TwoLevel)
         return self, surface_textures, instances, two_level
 
+    def prototypes(self, sample: int) -> list[MeshBatch]:
+        """The batch of each `Instances` of a shutter sample."""
+        assert self._layout is not None
+        return self._layout.samples[sample].prototypes
+
+    def prototype_roots(self, sample: int) -> list[int]:
+        """`Instance.root` of each `Instances` of a shutter sample."""
+        return [self._forest.root(batch.tree) for batch in self.prototypes(sample)]
+
+    def root_nodes(self, sample: int) -> list[int]:
+        """The node at which the tree of each `Instances` of a shutter sample begins; -1 on CUDA."""
+        return [self._forest.root_node(batch.tree) for batch in self.prototypes(sample)]
+
+    def refit_boxes(self, batch: MeshBatch) -> None:
+        """Refits the tree of a batch whose points have changed on the device."""
+        points, indices = self._tables["points"].array, self._tables["indices"].array
+        self._forest.refit_boxes(batch.tree, points, indices, batch.point_rows, batch.triangle_rows.start)
+
     def first_triangles(self, sample: int) -> list[int]:
         """The row of the first triangle of each mesh of a shutter sample, in storage order; -1: the mesh has none."""
         assert self._layout is not None

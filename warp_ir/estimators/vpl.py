@@ -41,7 +41,7 @@ from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_prim
 from warp_ir.guiding import learn
 from warp_ir.sampling import sobol
 from warp_ir.settings import ResolvedSettings
-from warp_ir.surface import albedo, shading_point
+from warp_ir.surface import ShadingPoint, albedo, shading_point
 from warp_ir.tiles import indices
 from warp_ir.vpl.emission import emit_vpls
 from warp_ir.vpl.gather import gather
@@ -50,11 +50,82 @@ from warp_ir.vpl.sets import ON_LIGHTS, ON_SURFACES, VplSets, build_sets
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_SHADOW_RAYS = (4, 4)
+SHADOW_RAYS = (4, 4)
 """Shadow rays per pixel and iteration, to VPLs on lights and to VPLs on surfaces."""
-_COMPENSATION_SHADOW_RAYS = (2, 2)
+COMPENSATION_SHADOW_RAYS = (2, 2)
 """Shadow rays at the end of a compensation ray, whose light has lost most of its weight."""
 _ROULETTE_DEPTH = wp.constant(2)
+
+
+@wp.struct
+class Irradiance:
+    """Irradiance [W m⁻²] at a point."""
+
+    direct: wp.vec3
+    indirect: wp.vec3
+
+
+@wp.func
+def gather_path(
+    scene: SceneData,
+    vpl_sets: wp.array[VplSets],
+    settings: GatherSettings,
+    camera_vertex: ShadingPoint,
+    index: int,
+    is_gathered: bool,
+    gathered: Irradiance,
+) -> Irradiance:
+    """The irradiance of VPLs at a point that the camera sees, with what the bound takes away.
+
+    Args:
+        scene: The scene.
+        vpl_sets: The VPLs.
+        settings: Numbers of rays, and the scramble.
+        camera_vertex: The point.
+        index: Index of the pixel's point of the sequence.
+        is_gathered: Whether `gathered` is known; else it is gathered here.
+        gathered: Irradiance at the point from VPLs, bounded.
+    """
+    x = camera_vertex
+    out = gathered
+    scramble = gather_scramble(settings)
+    # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
+    u_set = sobol.sample_1d(scene.sobol, index, 0, scramble)
+    throughput = wp.vec3(1.0)
+    bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
+    depth = int(0)
+    rays = settings.rays
+    while depth <= settings.max_bounces:
+        if depth > 0 or not is_gathered:
+            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, scramble)
+            bounces = settings.max_bounces - depth
+            from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
+            from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
+            if depth == 0:
+                out.direct = from_lights
+                out.indirect = from_surfaces
+            else:
+                out.indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
+
+        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, scramble)
+        compensation = compensate(scene, x, v, bound)
+        emitted = wp.cw_mul(throughput, compensation.emitted) * wp.pi
+        if depth == 0:
+            out.direct += emitted
+        else:
+            out.indirect += emitted
+        if compensation.clamped <= 0.0:
+            break
+        throughput = wp.cw_mul(throughput, albedo(scene, compensation.hit, scene.footprint)) * compensation.clamped
+        if depth > _ROULETTE_DEPTH:
+            survival = wp.min(wp.max(throughput), 0.99)
+            if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
+                break
+            throughput = throughput / survival
+        x = shading_point(scene, compensation.hit)
+        rays = settings.compensation_rays
+        depth += 1
+    return out
 
 
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
@@ -72,59 +143,21 @@ def _gather_pixels(
     """
     i = first + wp.tid()
     pixel = int(-1)
+    gathered = Irradiance()
     if wave.size == 0:
         pixel = reflecting_pixel(gbuffer, i)
     elif i < continuing_paths(wave):
         i = wave.paths[i]
         pixel = wave_pixel(gbuffer, wave, i)
+        gathered.direct = wave.irradiance[i]
+        gathered.indirect = wave.irradiance[wave.size + i]
     if pixel < 0:
         return
-    direct = wp.vec3(0.0)
-    indirect = wp.vec3(0.0)
     index = sample_index(settings, gbuffer, pixel)
-    scramble = gather_scramble(settings)
-    # The choice of the set has a sample dimension of its own, so neighbouring pixels evaluate different sets.
-    u_set = sobol.sample_1d(scene.sobol, index, 0, scramble)
     x = camera_vertex(gbuffer, pixel)
-    throughput = wp.vec3(1.0)
-    bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
-    depth = int(0)
-    rays = settings.rays
-    while depth <= settings.max_bounces:
-        if depth == 0 and wave.size > 0:
-            direct = wave.irradiance[i]
-            indirect = wave.irradiance[wave.size + i]
-        else:
-            u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, scramble)
-            bounces = settings.max_bounces - depth
-            from_lights = gather(scene.address, vpl_sets, ON_LIGHTS, u_set, x, u[0], rays[0], bounces)
-            from_surfaces = gather(scene.address, vpl_sets, ON_SURFACES, u_set, x, u[1], rays[1], bounces)
-            if depth == 0:
-                direct = from_lights
-                indirect = from_surfaces
-            else:
-                indirect += wp.cw_mul(throughput, from_lights + from_surfaces)
-
-        v = sobol.sample_2d(scene.sobol, index, 4 * depth + 3, scramble)
-        compensation = compensate(scene, x, v, bound)
-        emitted = wp.cw_mul(throughput, compensation.emitted) * wp.pi
-        if depth == 0:
-            direct += emitted
-        else:
-            indirect += emitted
-        if compensation.clamped <= 0.0:
-            break
-        throughput = wp.cw_mul(throughput, albedo(scene, compensation.hit, scene.footprint)) * compensation.clamped
-        if depth > _ROULETTE_DEPTH:
-            survival = wp.min(wp.max(throughput), 0.99)
-            if wp.frac(v[0] * 1024.0) >= survival:  # low digits of v are independent of the direction
-                break
-            throughput = throughput / survival
-        x = shading_point(scene, compensation.hit)
-        rays = settings.compensation_rays
-        depth += 1
-    gbuffer.normal_or_direct[pixel] = direct / wp.pi
-    gbuffer.indirect[pixel] = indirect / wp.pi
+    irradiance = gather_path(scene, vpl_sets, settings, x, index, wave.size > 0, gathered)
+    gbuffer.normal_or_direct[pixel] = irradiance.direct / wp.pi
+    gbuffer.indirect[pixel] = irradiance.indirect / wp.pi
 
 
 class VplEstimator:
@@ -173,7 +206,7 @@ class VplEstimator:
         gathering = GatherSettings()
         gathering.first_column, gathering.first_row = self._camera.first_column, self._camera.first_row
         gathering.scramble = self._scramble
-        gathering.rays, gathering.compensation_rays = wp.vec2i(*_SHADOW_RAYS), wp.vec2i(*_COMPENSATION_SHADOW_RAYS)
+        gathering.rays, gathering.compensation_rays = wp.vec2i(*SHADOW_RAYS), wp.vec2i(*COMPENSATION_SHADOW_RAYS)
         gathering.max_bounces = settings.max_bounces
         with launcher.phase("gather"):
             inputs = [guide.scene.data, gbuffer, vpl_sets, gathering]

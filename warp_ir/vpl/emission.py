@@ -54,7 +54,7 @@ _RETRACED_SHARE = 0.02
 """Approximate share of the light paths that are longer than what is recorded of them."""
 _MAX_RECORDED = 2**22
 """Largest number of recorded reflections, 48 bytes each."""
-_CAPACITY_PER_PATH = 8
+CAPACITY_PER_PATH = 8
 """Least capacity for VPLs on surfaces, per light path: their mean number where 8/9 of the light is reflected."""
 _MAX_CAPACITY = 2**26
 """Largest capacity for VPLs on surfaces, 64 bytes each."""
@@ -107,7 +107,7 @@ def _survival_sample(scramble: wp.uint32, path: int, bounce: int) -> float:
 
 
 @wp.func
-def _surface_row(settings: LightPathSettings, number: int, total: int) -> int:
+def surface_row(settings: LightPathSettings, number: int, total: int) -> int:
     """The row of VPL `number` of `total` on surfaces; -1: it is dropped, because not all of them can be stored.
 
     Systematic sampling: the stored VPLs are spread evenly, and each is stored with the same probability.
@@ -121,7 +121,7 @@ def _surface_row(settings: LightPathSettings, number: int, total: int) -> int:
 
 
 @wp.func
-def _thinning_weight(settings: LightPathSettings, total: int) -> float:
+def thinning_weight(settings: LightPathSettings, total: int) -> float:
     """Factor of a stored VPL's intensity that makes up for the VPLs that could not be stored."""
     if total <= settings.capacity:
         return 1.0
@@ -209,7 +209,7 @@ def _trace_segment(
 
 
 @wp.func(inline=False)
-def _trace_light_path(
+def trace_light_path(
     address: wp.uint64,
     settings: LightPathSettings,
     i: int,
@@ -223,7 +223,7 @@ def _trace_light_path(
     """Traces light path `i`, and returns the number n of VPLs that it leaves on surfaces.
 
     The VPLs skip + 1 ... min(end, n) are written to `vpls`. The j-th is number first_number + (j - 1) number_stride of
-    `total`, from which `_surface_row` gives its row. With skip = 0 the point on the light is written to row i.
+    `total`, from which `surface_row` gives its row. With skip = 0 the point on the light is written to row i.
     """
     scene = scene_at(address)[0]
     u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble[0])
@@ -285,11 +285,11 @@ def _trace_light_path(
         if survives:
             vpl_count += 1
             if vpl_count > skip and vpl_count <= end:
-                row = _surface_row(settings, first_number + (vpl_count - 1) * number_stride, total)
+                row = surface_row(settings, first_number + (vpl_count - 1) * number_stride, total)
                 if row >= 0:
                     vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-                    vpls.intensity[row] = intensity * _thinning_weight(settings, total)
+                    vpls.intensity[row] = intensity * thinning_weight(settings, total)
                     vpls.bounce[row] = bounce
                     if scene.uneven == 1:
                         vpls.lift[row] = scene.emitter_lift[light.emitter]
@@ -327,16 +327,17 @@ def _trace_light_paths(
         total = ends[settings.paths - 1]
         skip = settings.recorded
         end = lengths[i]
-    length = _trace_light_path(scene.address, settings, i, vpls, number, stride, total, skip, end)
+    length = trace_light_path(scene.address, settings, i, vpls, number, stride, total, skip, end)
     if settings.again == 0:
         lengths[i] = length
 
 
 @wp.func
-def _copy(source: VplBuffer, row: int, target: VplBuffer, to: int, thinning_weight: float) -> None:
+def copy_vpl(source: VplBuffer, row: int, target: VplBuffer, to: int, weight: float) -> None:
+    """Copies a VPL from a row of one buffer to a row of another; its intensity is multiplied by a weight."""
     target.position[to] = source.position[row]
     target.normal[to] = source.normal[row]
-    target.intensity[to] = source.intensity[row] * thinning_weight
+    target.intensity[to] = source.intensity[row] * weight
     target.bounce[to] = source.bounce[row]
     if source.lifted == 1:
         target.lift[to] = source.lift[row]
@@ -358,11 +359,11 @@ def _store_light_paths(
     total = ends[settings.paths - 1]
     number = ends[i] - lengths[i]
     for k in range(wp.min(lengths[i], settings.recorded)):
-        row = _surface_row(settings, number + k, total)
+        row = surface_row(settings, number + k, total)
         if row >= 0:
-            _copy(traced, settings.on_lights + settings.paths * k + i, vpls, row, _thinning_weight(settings, total))
+            copy_vpl(traced, settings.on_lights + settings.paths * k + i, vpls, row, thinning_weight(settings, total))
     if i < settings.on_lights:
-        _copy(traced, i, vpls, i, 1.0)
+        copy_vpl(traced, i, vpls, i, 1.0)
         vpls.pdf_area[i] = traced.pdf_area[i]
         if scene.modifier_count > 0:
             vpls.modifiers[i] = traced.modifiers[i]
@@ -419,7 +420,7 @@ def emit_vpls(
         settings.survivors = scratch.upload("survivors", alive, wp.int32)
     recorded = _recorded_length(paths, scene.mean_albedo)
     settings.recorded = min(recorded, max_bounces)
-    settings.capacity = min(paths * min(max(recorded, _CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
+    settings.capacity = min(paths * min(max(recorded, CAPACITY_PER_PATH), max_bounces), _MAX_CAPACITY)
 
     # Two passes: paths are stored when the lengths of all are known. So every path has its rows without atomics, and no
     # path has a maximal length; the few that are longer than what was recorded of them are followed again.

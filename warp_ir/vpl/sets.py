@@ -100,7 +100,7 @@ def intensity_and_bounce(group: VplSets, slot: int) -> wp.vec4:
 
 
 @wp.func
-def _spread_bits(x: int) -> int:
+def spread_bits(x: int) -> int:
     """The lowest six bits of x, with two zeros after each: one coordinate of a Morton code."""
     y = (x | (x << 8)) & 0x0F00F
     y = (y | (y << 4)) & 0x0C30C3
@@ -108,7 +108,7 @@ def _spread_bits(x: int) -> int:
 
 
 @wp.func
-def _divide_blocks(count: int, most: int) -> wp.vec2i:
+def divide_blocks(count: int, most: int) -> wp.vec2i:
     """The number of sets (a power of two, at most `most`), and the number of blocks in each."""
     blocks = (count + _LANES - 1) // _LANES
     sets = int(1)
@@ -128,7 +128,7 @@ def _with_counts(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) ->
 
 
 @wp.func
-def _bound(evaluated: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
+def bound_on_geometry(evaluated: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
     """The bound on G where a pixel evaluates `evaluated` VPLs, `on_lights` of them on lights.
 
     A VPL stands for area/evaluated of the surfaces. G can exceed the bound within a disk of `_BOUND_AREAS` times that
@@ -167,11 +167,11 @@ def _divide_into_sets(
     """
     i = first + wp.tid()
     vpls = lights.vpls
-    of_lights = _divide_blocks(vpls.on_lights, settings.max_sets)
-    of_surfaces = _divide_blocks(vpls.count[0] - vpls.on_lights, settings.max_sets)
+    of_lights = divide_blocks(vpls.on_lights, settings.max_sets)
+    of_surfaces = divide_blocks(vpls.count[0] - vpls.on_lights, settings.max_sets)
     if i == 0:
         evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
-        bound = _bound(evaluated, _LANES * of_lights[1], settings.density, settings.area)
+        bound = bound_on_geometry(evaluated, _LANES * of_lights[1], settings.density, settings.area)
         vpl_sets[0] = _with_counts(lights, of_lights, vpls.on_lights, bound)
         vpl_sets[1] = _with_counts(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
     lights.order[i] = i
@@ -181,17 +181,17 @@ def _divide_into_sets(
         code = int(0)
         for k in range(3):
             cell = wp.clamp(int((p[k] / settings.extent + 0.5) * 64.0), 0, 63)
-            code = code | (_spread_bits(cell) << k)
+            code = code | (spread_bits(cell) << k)
         if i < vpls.on_lights:
             keys[i] = code | ((i // (of_lights[1] * _LANES)) << 18)
         else:
             keys[i] = code | (((i - vpls.on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 30)
 
 
-@wp.kernel
-def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
-    """Packs block `i`; blocks of lights come first. Every lane follows its own section of the set's Z-order curve."""
-    i = first + wp.tid()
+@wp.func
+def pack_block(vpl_sets: wp.array[VplSets], block: int) -> None:
+    """Packs a block; blocks of lights come first. Every lane follows its own section of the set's Z-order curve."""
+    i = block
     kind = int(ON_LIGHTS)
     if i >= vpl_sets[kind].sets * vpl_sets[kind].blocks:
         i -= vpl_sets[kind].sets * vpl_sets[kind].blocks
@@ -220,10 +220,10 @@ def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
         group.rows[BLOCK_ROWS * i + 9][lane] = bound
 
 
-@wp.kernel
-def _pack_slots(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+@wp.func
+def pack_slot(scene: SceneData, vpl_sets: wp.array[VplSets], first_slot: int) -> None:
     """Packs the rows of one VPL; those on lights come first."""
-    slot = first + wp.tid()
+    slot = first_slot
     kind = int(ON_LIGHTS)
     if slot >= vpl_sets[kind].count:
         slot -= vpl_sets[kind].count
@@ -252,10 +252,9 @@ def _pack_slots(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> No
         group.slot_shaping[SLOT_SHAPING_ROWS * slot + 1] = ramp
 
 
-@wp.kernel
-def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+@wp.func
+def pack_shaping(scene: SceneData, vpl_sets: wp.array[VplSets], i: int) -> None:
     """Packs the rows of shaping of block `i`."""
-    i = first + wp.tid()
     group = vpl_sets[ON_LIGHTS]
     if i >= group.sets * group.blocks:
         return
@@ -274,6 +273,24 @@ def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> 
             group.shaping[SHAPING_ROWS * i + k][lane] = axis[k]
         for k in range(4):
             group.shaping[SHAPING_ROWS * i + 3 + k][lane] = ramp[k]
+
+
+@wp.kernel
+def _pack(first: int, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs one block."""
+    pack_block(vpl_sets, first + wp.tid())
+
+
+@wp.kernel
+def _pack_slots(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs the rows of one VPL."""
+    pack_slot(scene, vpl_sets, first + wp.tid())
+
+
+@wp.kernel
+def _pack_shaping(first: int, scene: SceneData, vpl_sets: wp.array[VplSets]) -> None:
+    """Packs the rows of shaping of one block."""
+    pack_shaping(scene, vpl_sets, first + wp.tid())
 
 
 def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplSets]:
