@@ -154,7 +154,7 @@ def test_bytes_per_pixel(scene, settings, monkeypatch):
         picture = film.radiance()
         film.error()
         alive.append(renderer.launcher.alive() + picture.nbytes)
-    estimate = pixel_bytes(scene, renderer.settings)
+    estimate = pixel_bytes(scene, renderer.settings, guided=False)
     assert (alive[1] - alive[0]) / (48**2 - 16**2) == pytest.approx(estimate, rel=0.01)
 
 

@@ -278,6 +278,24 @@ def camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
     x.shading_normal = gbuffer.shading_normal[pixel]
     x.mesh = gbuffer.mesh[pixel]
     x.from_camera = True
+    x.tile = -1
+    return x
+
+
+@wp.func
+def vertex_of_hit(scene: SceneData, hit: CameraHit) -> ShadingPoint:
+    """The `camera_vertex` of a camera ray's hit."""
+    x = ShadingPoint()
+    x.position = hit.position
+    x.geometric_normal = hit.normal
+    x.normal = hit.normal
+    x.smooth_height = hit.smooth_height
+    if hit.smooth_height > 0.0:
+        x.normal = hit.smooth_normal
+    x.shading_normal = hit.shading_normal
+    x.mesh = hit.mesh
+    x.from_camera = True
+    x.tile = -1
     return x
 
 

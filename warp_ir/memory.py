@@ -1,5 +1,6 @@
 """Estimates of the memory that a pixel and a scene take where they are rendered, before anything is uploaded."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -38,16 +39,18 @@ _SAMPLE_BUFFER = {
 # Scratch of the filter, in the memory of the iteration: two layers of direct and indirect light with their variance.
 _FILTER_SCRATCH = {"layers": 4 * _VEC4, "variance": _VEC2}  # 72
 _RESOLVED_PICTURE = {"direct, indirect": 2 * _VEC3}  # 24
+_TILE_VISIBILITY = {"to_lights, to_surfaces": 2 * _FLOAT, "rays": 2 * _INT / 64}  # 64 factors of each for 64 pixels
 _REPROJECTION = {"samples sorted by pixels": 4 * _INT * 9 // 8}  # 18: scratch buffers have an eighth in reserve
 _SURFACE_POINT = {"triangle, instance, weights": 3 * _INT}  # 12
 _DENOISER = 100  # approximately, for its inputs and output; what the denoiser itself allocates is not counted
 
 
-def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
+def pixel_bytes(scene: Scene, settings: RenderSettings, *, guided: bool = True) -> int:
     """Bytes per pixel on the device while a scene is rendered, plus those of its picture on the host.
 
     The sum of: the film; the buffers of one iteration, or the filter's scratch if that is larger, since they share
-    memory; the sample buffer and the resolved picture of the filter; what defocus, motion blur and the denoiser add.
+    memory; the sample buffer and the resolved picture of the filter; what defocus, motion blur and the denoiser add;
+    and what is learned of visibility, where light paths are `guided`.
     """
     emission = _VEC3 * (scene.glows or settings.visible_lights)
     smooth_normal = _VEC3 * any(material.normal_texture is not None for material in scene.materials)
@@ -55,11 +58,13 @@ def pixel_bytes(scene: Scene, settings: RenderSettings) -> int:
     iteration = sum(_ITERATION.values()) + emission + smooth_normal + smooth_height
     film = sum(_FILM.values()) + emission + _INT * settings.visible_lights
     host_picture = _VEC3
+    shutter = scene.shutter if settings.motion_blur else ()
+    defocus = settings.depth_of_field and scene.camera.lens_radius > 0.0
+    if guided and settings.estimator == "vpl" and not defocus and len(shutter) < 2:
+        film += math.ceil(sum(_TILE_VISIBILITY.values()))
     if not settings.filter or settings.estimator != "vpl":
         return film + iteration + host_picture + _DENOISER * settings.denoise
-    shutter = scene.shutter if settings.motion_blur else ()
     moves = len({_surface_ids(sample) for sample in shutter}) > 1
-    defocus = settings.depth_of_field and scene.camera.lens_radius > 0.0
     return (
         film
         + max(iteration, sum(_FILTER_SCRATCH.values()))

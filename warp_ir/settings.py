@@ -190,6 +190,8 @@ class GuidingSettings:
 
     first_iteration: int = 0
     """Iterations before this one are not guided."""
+    visibility: bool = True
+    """Whether shadow rays are drawn by what is learned of visibility."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,11 +34,13 @@ from warp_ir.estimators.wavefront import (
     continuing_paths,
     gather_in_waves,
     gather_scramble,
+    lit_vertex,
     sample_index,
+    shadow_rays,
     wave_pixel,
 )
-from warp_ir.gbuffer import GBuffer, camera_vertex, reflecting_pixel, trace_primary
-from warp_ir.guiding import learn
+from warp_ir.gbuffer import GBuffer, reflecting_pixel, trace_primary
+from warp_ir.guiding import learn, learn_visibility
 from warp_ir.sampling import sobol
 from warp_ir.settings import ResolvedSettings
 from warp_ir.surface import ShadingPoint, albedo, shading_point
@@ -94,7 +96,7 @@ def gather_path(
     throughput = wp.vec3(1.0)
     bound = vpl_sets[ON_LIGHTS].bound  # equal for VPLs on lights and on surfaces
     depth = int(0)
-    rays = settings.rays
+    rays = shadow_rays(settings, x)
     while depth <= settings.max_bounces:
         if depth > 0 or not is_gathered:
             u = sobol.sample_2d(scene.sobol, index, 4 * depth + 1, scramble)
@@ -154,7 +156,7 @@ def _gather_pixels(
     if pixel < 0:
         return
     index = sample_index(settings, gbuffer, pixel)
-    x = camera_vertex(gbuffer, pixel)
+    x = lit_vertex(settings, gbuffer, pixel)
     irradiance = gather_path(scene, vpl_sets, settings, x, index, wave.size > 0, gathered)
     gbuffer.normal_or_direct[pixel] = irradiance.direct / wp.pi
     gbuffer.indirect[pixel] = irradiance.indirect / wp.pi
@@ -171,6 +173,8 @@ class VplEstimator:
         self._scene, self._camera, self._settings = scene, camera, settings
         self._scratch, self._launcher = scratch, scratch.launcher
         self._unguided = unguided(scene, scratch.launcher)
+        self._at_hand: tuple[int, wp.array[VplSets] | None] = -1, None
+        """The iteration, if any, whose VPLs are where those of the next are to be, and these VPLs."""
         self._guide: Guide | None = None
         """The guide, once it has been learned."""
         guiding = settings.guiding
@@ -185,15 +189,10 @@ class VplEstimator:
         self._iteration = self._scratch.number("iteration", iteration, wp.int32)
         return self._guide_of(iteration)
 
-    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
-        """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
-        settings, launcher = self._settings, self._launcher
-        guide = self.prepare(iteration)
-
-        def trace_camera() -> None:
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
-
-        with launcher.overlap("primary", trace_camera), launcher.phase("emission"):
+    def _vpls_of(self, iteration: int, guide: Guide) -> "wp.array[VplSets]":
+        """The VPLs of an iteration, arranged in sets."""
+        settings = self._settings
+        with self._launcher.phase("emission"):
             vpls = emit_vpls(
                 guide,
                 self._scratch,
@@ -202,12 +201,27 @@ class VplEstimator:
                 max_bounces=settings.max_bounces,
                 scramble=sobol.iteration_scramble(settings.seed, iteration),
             )
-            vpl_sets = build_sets(vpls, guide, self._scratch)
+            return build_sets(vpls, guide, self._scratch)
+
+    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
+        """Fills the G-buffer, direct and indirect irradiance included, for one iteration."""
+        settings, launcher = self._settings, self._launcher
+        guide = self.prepare(iteration)
+
+        def trace_camera() -> None:
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
+
+        with launcher.overlap("primary", trace_camera):
+            if iteration == self._at_hand[0]:
+                vpl_sets = self._at_hand[1]
+            else:
+                vpl_sets = self._vpls_of(iteration, guide)
+            self._at_hand = -1, None
         gathering = GatherSettings()
         gathering.first_column, gathering.first_row = self._camera.first_column, self._camera.first_row
         gathering.scramble = self._scramble
         gathering.rays, gathering.compensation_rays = wp.vec2i(*SHADOW_RAYS), wp.vec2i(*COMPENSATION_SHADOW_RAYS)
-        gathering.max_bounces = settings.max_bounces
+        gathering.max_bounces, gathering.visibility = settings.max_bounces, guide.visibility
         with launcher.phase("gather"):
             inputs = [guide.scene.data, gbuffer, vpl_sets, gathering]
             if launcher.wavefront:
@@ -221,5 +235,12 @@ class VplEstimator:
             return self._unguided
         if self._guide is None:
             with self._launcher.phase("guiding"):
-                self._guide = learn(self._scene, self._camera, self._launcher, self._settings)
+                guide = learn(self._scene, self._camera, self._launcher, self._settings)
+            if guide.visibility.columns > 0:
+                # Those of one iteration, which is often the present one, so that others learn the same.
+                vpl_sets = self._vpls_of(self._first_guided, guide)
+                self._at_hand = self._first_guided, vpl_sets
+                with self._launcher.phase("guiding"):
+                    learn_visibility(guide, self._camera, self._launcher, vpl_sets, self._settings.seed)
+            self._guide = guide
         return self._guide

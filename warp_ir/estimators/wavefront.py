@@ -30,8 +30,9 @@ from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cosine_hemisphere
 from warp_ir.surface import Hit, ShadingPoint, closest, geometry_term_of_hit, shadow_ray_origin
 from warp_ir.tiles import indices, pixel_at
-from warp_ir.vpl.gather import draw_slots, slot_contribution
+from warp_ir.vpl.gather import MAX_RAYS, draw_slots, slot_contribution
 from warp_ir.vpl.sets import MAX_SETS, ON_LIGHTS, ON_SURFACES, VplSets
+from warp_ir.vpl.visibility import TileVisibility, tile_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -53,6 +54,7 @@ class GatherSettings:
     rays: wp.vec2i  # shadow rays to VPLs on lights and on surfaces
     compensation_rays: wp.vec2i  # shadow rays at the end of a compensation ray
     max_bounces: int
+    visibility: TileVisibility  # its `rays` take the place of `rays` at what the camera sees
 
 
 @wp.struct
@@ -83,6 +85,24 @@ def sample_index(settings: GatherSettings, gbuffer: GBuffer, pixel: int) -> int:
     column = settings.first_column + pixel % gbuffer.tiles.columns
     row = settings.first_row + pixel // gbuffer.tiles.columns
     return sobol.index_of_pixel(column, row, gather_scramble(settings))
+
+
+@wp.func
+def lit_vertex(settings: GatherSettings, gbuffer: GBuffer, pixel: int) -> ShadingPoint:
+    """The `camera_vertex` of a pixel, with what is known of the visibility of VPLs there."""
+    x = camera_vertex(gbuffer, pixel)
+    column = settings.first_column + pixel % gbuffer.tiles.columns
+    row = settings.first_row + pixel // gbuffer.tiles.columns
+    x.tile = tile_of(settings.visibility, column, row)
+    return x
+
+
+@wp.func
+def shadow_rays(settings: GatherSettings, x: ShadingPoint) -> wp.vec2i:
+    """Numbers of shadow rays to VPLs on lights and on surfaces, from a point that the camera sees."""
+    if x.tile >= 0:
+        return settings.visibility.rays[x.tile]
+    return settings.rays
 
 
 @wp.struct
@@ -158,10 +178,10 @@ def _draw_vpls(
     index = sample_index(settings, gbuffer, pixel)
     u_set = sobol.sample_1d(scene.sobol, index, 0, gather_scramble(settings))
     u = sobol.sample_1d(scene.sobol, index, 1 + kind, gather_scramble(settings))
-    x = camera_vertex(gbuffer, pixel)
+    x = lit_vertex(settings, gbuffer, pixel)
     group = vpl_sets[kind]
     set_index = int(u_set * float(group.sets))
-    per_ray = draw_slots(group, set_index, x, u, settings.rays[kind], wave.slots, thread, 2 * wave.size)
+    per_ray = draw_slots(group, set_index, x, u, shadow_rays(settings, x)[kind], wave.slots, thread, 2 * wave.size)
     wave.per_ray[thread] = per_ray * float(group.sets)
 
 
@@ -176,11 +196,11 @@ def _send_shadow_rays(
     pixel = wave_pixel(gbuffer, wave, i)
     if pixel < 0:
         return
-    x = camera_vertex(gbuffer, pixel)
+    x = lit_vertex(settings, gbuffer, pixel)
     per_ray = wave.per_ray[thread]
     out = wp.vec3(0.0)
     if per_ray > 0.0:
-        for k in range(settings.rays[kind]):
+        for k in range(shadow_rays(settings, x)[kind]):
             slot = wave.slots[thread + 2 * wave.size * k]
             if slot >= 0:
                 out += slot_contribution(scene, vpl_sets[kind], x, slot, per_ray, settings.max_bounces)
@@ -229,7 +249,7 @@ def gather_in_waves(continue_paths: Any, inputs: Sequence[Any], scratch: Scratch
     launcher, gbuffer = scratch.launcher, inputs[1]
     count = indices(gbuffer.tiles)
     for begin in range(0, count, MAX_WAVE):
-        wave = _new_wave(begin, min(MAX_WAVE, count - begin), max(inputs[3].rays), scratch)
+        wave = _new_wave(begin, min(MAX_WAVE, count - begin), MAX_RAYS, scratch)
         launcher.launch(_write_keys, wave.size, [*inputs, wave])
         wp.utils.radix_sort_pairs(wave.keys, wave.order, wave.size, end_bit=_KEY_BITS)
         launcher.launch(_draw_vpls, 2 * wave.size, [*inputs, wave])

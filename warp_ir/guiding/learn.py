@@ -8,8 +8,9 @@ are connected with points that the camera sees. From these samples are learned
 * the probability of selecting each emitter                            emitter_selection.py
 * the point close to which the light of suns and skies passes          photon_target.py
 * what the picture gains from a light path, wherever it is             importance.py
+* which VPLs each tile of the picture sees                             visibility.py
 
-By the last of them paths choose their directions, and VPLs survive; and its variance tells how many paths there should
+By the third of them paths choose their directions, and VPLs survive; and its variance tells how many paths there should
 be. What is learned from some samples is measured by others, and where the gain is small, nothing changes. The result is
 a pure function of the scene, the camera, the size of the image and the seed: whoever renders some iterations of a
 picture, or a part of it, learns the same.
@@ -30,6 +31,7 @@ from warp_ir.guiding.probes import (
     light_vertices,
     trace_camera_probes,
 )
+from warp_ir.guiding.visibility import new_visibility
 from warp_ir.settings import ResolvedSettings
 from warp_ir.vpl.guide import Guide, unguided
 
@@ -58,8 +60,8 @@ _PIXELS_PER_PATH = 2
 def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: ResolvedSettings) -> Guide:
     """Traces probe paths, and returns the guide of a view.
 
-    The launcher's counts `guided_emitters`, `guided_far_lights`, `guided_paths` and `guided_vpls` say what was changed:
-    1 or 0.
+    The launcher's counts `guided_emitters`, `guided_far_lights`, `guided_paths`, `guided_vpls` and `guided_rays` say
+    what was changed: 1 or 0. The tables of visibility are allocated only: `learn_visibility` fills them in.
 
     Args:
         scene: The scene.
@@ -80,11 +82,14 @@ def learn(scene: DeviceScene, camera: CameraData, launcher: Launcher, settings: 
             guide = replace(guide, scene=guided_scene or scene, photon_target=photon_target or guide.photon_target)
         if settings.max_bounces > 0:
             guide, survival = _guide_paths(guide, launcher, probes, pixels, settings)
+        if settings.guiding and settings.guiding.visibility and not camera.blurs:
+            guide = replace(guide, visibility=new_visibility(camera, launcher))
     decisions = {
         "guided_emitters": guided_scene is not None,
         "guided_far_lights": photon_target is not None,
         "guided_paths": guide.importance.candidates > 1,
         "guided_vpls": survival is not None,
+        "guided_rays": guide.visibility.columns > 0,
     }
     for name, result in decisions.items():
         launcher.profile.counts[name] = int(result)

@@ -24,6 +24,7 @@ class ShadingPoint:
     smooth_height: float  # of the smooth surface above the triangle, along `normal` [du]
     mesh: int
     from_camera: bool  # whether the camera sees the point
+    tile: int  # the tile of `TileVisibility` that shows it; -1: visibility is not known
 
 
 @wp.func
@@ -35,6 +36,7 @@ def shading_point(scene: SceneData, hit: Hit) -> ShadingPoint:
     x.shading_normal = hit.normal
     x.geometric_normal = hit.normal
     x.mesh = scene.triangle_mesh[hit.triangle]
+    x.tile = -1
     return x
 
 

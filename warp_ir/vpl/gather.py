@@ -7,7 +7,8 @@ f_k is cheap; V_k costs a ray.
   the same one as the other threads of its warp (`estimators.wavefront`).
 * **Resample visibility.** M VPLs are drawn in proportion to f, and only they get a shadow ray. With S = Σ f, each
   contributes V S/M, which is unbiased (resampled importance sampling, Talbot et al. 2005; here the M draws are
-  systematic along a curve through space).
+  systematic along a curve through space). Where visibility has been learned, they are drawn in proportion to f q
+  (`vpl.visibility`), and contribute V S/(M q).
 * **Interleave.** The VPLs are divided into sets; a pixel evaluates one set, its neighbours evaluate others (Keller and
   Heidrich 2001). So the cost of a pixel does not grow with the number of VPLs.
 * **Bound.** min(G, b) removes the weak singularity of G. `estimators.vpl` compensates for what this takes away.
@@ -31,6 +32,7 @@ from warp_ir.vpl.sets import (
     vec16,
     vec16i,
 )
+from warp_ir.vpl.visibility import CELLS, CELLS_OF_LANE, factor_row, section_begin
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -38,6 +40,9 @@ _LANES = wp.constant(LANES)
 MAX_RAYS = 8
 """Largest number of shadow rays of a call."""
 _MAX_RAYS = wp.constant(MAX_RAYS)
+_CELLS = wp.constant(CELLS)
+_KEPT_BLOCKS = wp.constant(32)
+"""Blocks whose weights are kept from the first pass to the second: nearly always all of a set."""
 
 
 @wp.func_native("""
@@ -90,14 +95,27 @@ def _block_shaping(
     ...
 
 
+@wp.func_native("""
+    wp::vec_t<16, float> out;
+    for (int i = 0; i < 16; ++i) out[i] = v[i] * factors.data[first + i];
+    return out;
+""")
+def _times_row(v: vec16, factors: wp.array[wp.float32], first: int) -> vec16: ...
+
+
 @wp.func
-def _block_weights(group: VplSets, block: int, x: ShadingPoint) -> vec16:
-    """The weights f of the sixteen VPLs of a block, with the approximate shaping of lights."""
+def _block_weights(group: VplSets, block: int, x: ShadingPoint, row: int) -> vec16:
+    """The weights f q of the sixteen VPLs of a block; f is with the approximate shaping of lights.
+
+    The factors q begin at `row`; they are 1 if that is -1.
+    """
     contributions = _block_bounded_geometry(group.rows, BLOCK_ROWS * block, x)
     if group.shaped == 1:
         contributions = wp.cw_mul(
             contributions, _block_shaping(group.rows, BLOCK_ROWS * block, group.shaping, SHAPING_ROWS * block, x)
         )
+    if row >= 0:
+        contributions = _times_row(contributions, group.visibility, row)
     return contributions
 
 
@@ -141,6 +159,29 @@ def _sum(v: vec16) -> float: ...
 
 
 @wp.func
+def _learned_factor(group: VplSets, slot: int, x: ShadingPoint) -> float:
+    """The factor q of the VPL in a slot."""
+    lane = slot // group.blocks
+    section = (slot - lane * group.blocks) * CELLS_OF_LANE // group.blocks
+    return group.visibility[factor_row(x.tile, section) + lane % _LANES]
+
+
+@wp.func
+def _cell_factor(group: VplSets, cell: int, x: ShadingPoint) -> float:
+    """The factor q of the VPLs of a section."""
+    if x.tile < 0:
+        return 1.0
+    return group.visibility[factor_row(x.tile, cell % CELLS_OF_LANE) + cell // CELLS_OF_LANE]
+
+
+@wp.func
+def _cell_begin(group: VplSets, begin: int, cell: int) -> int:
+    """The first slot of a section of the set that begins at a slot."""
+    slot = begin + cell // CELLS_OF_LANE * group.blocks + section_begin(cell % CELLS_OF_LANE, group.blocks)
+    return wp.min(slot, group.count)
+
+
+@wp.func
 def _shadowed_contribution(
     scene: SceneData,
     group: VplSets,
@@ -160,6 +201,8 @@ def _shadowed_contribution(
         if vpl < group.vpls.on_lights:
             modifiers = group.vpls.modifiers[vpl]
     visibility = light_visibility(scene, modifiers, x, position)
+    if x.tile >= 0:
+        visibility = visibility / _learned_factor(group, slot, x)
     if modifiers >= 0:  # the approximate factor is part of f already
         visibility = visibility / approximate_shaping(
             scene.light_tables[0].modifiers.rows[modifiers], x.position, position
@@ -203,9 +246,15 @@ def _gather_in_blocks(
     """
     out = wp.vec3(0.0)
     begin = set_index * group.blocks
+    kept = wp.zeros(shape=_KEPT_BLOCKS, dtype=vec16)
     sums = vec16()
-    for block in range(begin, begin + group.blocks):
-        sums += _block_weights(group, block, x)
+    for section in range(CELLS_OF_LANE):
+        row = factor_row(x.tile, section)
+        for k in range(section_begin(section, group.blocks), section_begin(section + 1, group.blocks)):
+            weights = _block_weights(group, begin + k, x, row)
+            if k < _KEPT_BLOCKS:
+                kept[k] = weights
+            sums += weights
     total = _sum(sums)
     if total <= 0.0:
         return out
@@ -215,9 +264,14 @@ def _gather_in_blocks(
     target = _first_targets(sums, per_ray, u)
     running = vec16()
     count = vec16i()
-    for block in range(begin, begin + group.blocks):
-        running += _block_weights(group, block, x)
-        count = _count_below(running, target, count)
+    for section in range(CELLS_OF_LANE):
+        row = factor_row(x.tile, section)
+        for k in range(section_begin(section, group.blocks), section_begin(section + 1, group.blocks)):
+            if k < _KEPT_BLOCKS:
+                running += kept[k]
+            else:
+                running += _block_weights(group, begin + k, x, row)
+            count = _count_below(running, target, count)
     passed = float(0.0)
     rays_drawn = int(0)
     for lane in range(_LANES):
@@ -245,15 +299,28 @@ def _gather_in_blocks(
 
 
 @wp.func
+def slot_weight(group: VplSets, slot: int, x: ShadingPoint) -> float:
+    """The contribution f of the VPL in a slot."""
+    if on_cuda():
+        return _slot_weight(group, slot, x)
+    lane = slot // group.blocks
+    block = lane // _LANES * group.blocks + slot - lane * group.blocks
+    return _block_weights(group, block, x, -1)[lane % _LANES]
+
+
+@wp.func
 def _count_in_lane(group: VplSets, begin: int, lane: int, x: ShadingPoint, target: float) -> int:
     """Number of VPLs in a lane before its running sum passes a target."""
     running = float(0.0)
     k = int(0)
-    while k < group.blocks:
-        running += _block_weights(group, begin + k, x)[lane]
-        if running > target:
-            break
-        k += 1
+    for section in range(CELLS_OF_LANE):
+        row = factor_row(x.tile, section)
+        end = section_begin(section + 1, group.blocks)
+        while k < end:
+            running += _block_weights(group, begin + k, x, row)[lane]
+            if running > target:
+                return k
+            k += 1
     return k
 
 
@@ -285,28 +352,31 @@ def draw_slots(
     first: int,
     stride: int,
 ) -> float:
-    """Draws M VPLs of a set in proportion to f, and returns S/M: one running sum over the set, with M targets along it.
+    """Draws M VPLs of a set in proportion to f q, and returns S/M: one running sum over the set, M targets along it.
 
     The k-th is written to `slots[first + k stride]`: its slot, or -1 if none is at the target. Nothing is written where
     S = 0. The threads of a warp should have the same set: then they load the same rows at the same time.
     """
     begin = set_index * group.blocks * _LANES
-    end = wp.min(begin + group.blocks * _LANES, group.count)
     total = float(0.0)
-    for slot in range(begin, end):
-        total += _slot_weight(group, slot, x)
+    for cell in range(_CELLS):
+        factor = _cell_factor(group, cell, x)
+        for slot in range(_cell_begin(group, begin, cell), _cell_begin(group, begin, cell + 1)):
+            total += factor * _slot_weight(group, slot, x)
     if total <= 0.0:
         return 0.0
     per_ray = total / float(rays)
     running = float(0.0)
     drawn = int(0)
     target = u * per_ray
-    for slot in range(begin, end):
-        running += _slot_weight(group, slot, x)
-        while drawn < rays and target < running:
-            slots[first + drawn * stride] = slot
-            drawn += 1
-            target = (float(drawn) + u) * per_ray
+    for cell in range(_CELLS):
+        factor = _cell_factor(group, cell, x)
+        for slot in range(_cell_begin(group, begin, cell), _cell_begin(group, begin, cell + 1)):
+            running += factor * _slot_weight(group, slot, x)
+            while drawn < rays and target < running:
+                slots[first + drawn * stride] = slot
+                drawn += 1
+                target = (float(drawn) + u) * per_ray
     while drawn < rays:
         slots[first + drawn * stride] = -1
         drawn += 1
@@ -357,7 +427,7 @@ def _reciprocal_root(x: float) -> float:
 
 @wp.func
 def _slot_weight(group: VplSets, slot: int, x: ShadingPoint) -> float:
-    """The weight f of one VPL: `_block_weights` for one lane."""
+    """The contribution f of one VPL: `_block_weights` for one lane."""
     p = _load4(group.slots, SLOT_ROWS * slot)
     n = _load4(group.slots, SLOT_ROWS * slot + 1)
     weight_bound = _load4(group.slots, SLOT_ROWS * slot + 2)

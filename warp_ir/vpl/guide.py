@@ -1,11 +1,12 @@
 """A guide: the probabilities by which light paths go where they matter to the picture; `guiding` learns them.
 
-A `Guide` holds three kinds of probabilities. Samples are weighted by their inverses, so guiding adds no bias.
+A `Guide` holds four kinds of probabilities. Samples are weighted by their inverses, so guiding adds no bias.
 
 * Selection probabilities of emitters: tables of the scene, in `Guide.scene`.
 * The places where photons of lights at infinity enter the scene: `lights.PhotonTarget`.
 * The `ViewImportance`, what the picture gains from a VPL and from the path that goes on from it. Of several directions
   a path takes one in proportion to it, and VPLs survive in proportion to it (Georgiev and Slusallek 2010).
+* The `TileVisibility`, by which shadow rays are drawn.
 """
 
 import math
@@ -17,6 +18,7 @@ import warp as wp
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import DeviceScene
 from warp_ir.lights import PhotonTarget
+from warp_ir.vpl.visibility import TileVisibility, nothing_learned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -114,6 +116,8 @@ class Guide:
     """Where photons of lights at infinity enter the scene."""
     importance: ViewImportance
     """Contribution of VPLs and of what follows them, by which paths are guided and VPLs survive."""
+    visibility: TileVisibility
+    """Which VPLs the tiles of the picture see, by which shadow rays are drawn."""
     path_multiplier: int = 1
     """Number of light paths to trace for each that is asked for, where few of them contribute to the picture."""
     density_ratio: float = 1.0
@@ -125,7 +129,7 @@ def unguided(scene: DeviceScene, launcher: Launcher) -> Guide:
     importance = ViewImportance()
     importance.candidates = 1
     importance.per_intensity = launcher.empty(1, wp.vec2)
-    return Guide(scene, _target_of_details(scene, launcher), importance)
+    return Guide(scene, _target_of_details(scene, launcher), importance, nothing_learned(launcher))
 
 
 def _target_of_details(scene: DeviceScene, launcher: Launcher) -> PhotonTarget:

@@ -67,6 +67,7 @@ class VplSets:
     order: wp.array[wp.int32]  # rows in `vpls`: set by set, and within a set along a Z-order curve through space
     intensity_bounce: wp.array[wp.vec4]  # in that order: random lookups stay close together
     vpls: VplBuffer
+    visibility: wp.array[wp.float32]  # the factors of `TileVisibility` for VPLs of this kind
 
 
 @wp.func
@@ -318,6 +319,7 @@ def build_sets(vpls: VplBuffer, guide: Guide, scratch: Scratch) -> wp.array[VplS
         slots = end - begin if slotted else 0
         blocks.append(most)
         group.vpls, group.order = vpls, order[begin:] if end > begin else order
+        group.visibility = guide.visibility.to_lights if begin == 0 else guide.visibility.to_surfaces
         group.shaped = int(begin == 0 and scene.data.shaped_count > 0)
         group.rows = scratch.array(f"sets.{name}.rows", max(BLOCK_ROWS * most, 1), vec16)
         group.shaping = scratch.array(f"sets.{name}.shaping", max(SHAPING_ROWS * most * group.shaped, 1), vec16)
