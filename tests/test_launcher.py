@@ -130,6 +130,7 @@ def test_compiling_is_reported(monkeypatch, caplog):
 def test_kernel_cache_is_known(launcher):
     """A module that has been loaded lies in the cache where the loader looks for it; one with another text does not."""
     loader = ModuleLoader(launcher.device, 64)
+    definitions.define_all()
     launcher.load([accumulate])
     module = wp.get_module(accumulate.__name__)
     assert loader._is_cached(module)
