@@ -371,12 +371,14 @@ def compile_for(arch: int) -> int:
     _configure_warp()
     import warp as wp
 
+    from warp_ir.device import definitions
     from warp_ir.device.launcher import _BLOCK_DIM
 
     files = [path for path in (ROOT / "warp_ir").rglob("*.py") if "@wp.kernel" in path.read_text()]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sorted(files)]
     for name in [*names, "rays"]:
         importlib.import_module(name)
+    definitions.define_all()
     modules = [m for m in (wp.get_module(name) for name in [*names, "rays"]) if m.kernels]
     for module in modules:
         module.options["block_dim"] = _BLOCK_DIM

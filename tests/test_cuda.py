@@ -16,6 +16,7 @@ import warp_ir as ir
 import warp_ir.estimators.vpl
 import warp_ir.vpl.emission
 from tests.physics.scenes import box_with_lights
+from warp_ir.device import definitions
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import SceneData
 from warp_ir.procedural import cornell_box, furnace
@@ -72,6 +73,7 @@ def _add_one(first: int, numbers: wp.array[wp.float32]):
 @pytest.mark.parametrize("arch", [pytest.param(75, marks=pytest.mark.slow), 90])
 def test_kernels_compile_for_cuda(module, arch, tmp_path):
     """Turing and Hopper machine code comes out of every module, and no thread asks for more than it should."""
+    definitions.define_all()
     wp.compile_aot_module(wp.get_module(module), arch=arch, module_dir=tmp_path, use_ptx=False)
     (cubin,) = tmp_path.glob("*.cubin")
     used = resources(cubin)

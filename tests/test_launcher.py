@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_ir.device import definitions
 from warp_ir.device.compiling import ModuleLoader
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.film import accumulate
@@ -110,10 +111,13 @@ def test_unknown_device_is_named():
 def test_compiling_is_reported(monkeypatch, caplog):
     """What the kernel cache lacks is reported when it begins, after each module, and in the end; the rest is silent."""
     monkeypatch.setattr(wp, "load_module", lambda *_, **__: None)
+    monkeypatch.setattr(definitions, "load", lambda module: module.startswith("recorded"))
+    monkeypatch.setattr(definitions, "record", lambda *_: None)
     monkeypatch.setattr(ModuleLoader, "_is_cached", lambda self, module: module.startswith("cached"))
     loader = ModuleLoader(wp.get_device("cpu"), 64)
     with caplog.at_level(logging.INFO, "warp_ir"):
         loader.load("cached 1")
+        loader.load("recorded")
         assert not caplog.records
         loader.expect(["cached 2", "new 1", "new 2"])
         for module in ("new 1", "cached 2", "new 2", "new 1"):
@@ -126,6 +130,7 @@ def test_compiling_is_reported(monkeypatch, caplog):
 def test_kernel_cache_is_known(launcher):
     """A module that has been loaded lies in the cache where the loader looks for it; one with another text does not."""
     loader = ModuleLoader(launcher.device, 64)
+    definitions.define_all()
     launcher.load([accumulate])
     module = wp.get_module(accumulate.__name__)
     assert loader._is_cached(module)

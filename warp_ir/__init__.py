@@ -60,6 +60,7 @@ _HOME = {
     "write_image": "image",
     "read_image": "image",
 }
+_WITH_KERNELS = ("film", "renderer", "vpl.trace")
 __all__ = sorted(_HOME)
 
 
@@ -68,7 +69,12 @@ if not TYPE_CHECKING:  # a type checker must not take every name for one that ex
     def __getattr__(name: str) -> Any:
         if name not in _HOME:
             raise AttributeError(f"module 'warp_ir' has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"warp_ir.{_HOME[name]}"), name)
+        if _HOME[name] in _WITH_KERNELS:
+            with importlib.import_module("warp_ir.device.definitions").put_off():
+                home = importlib.import_module(f"warp_ir.{_HOME[name]}")
+        else:
+            home = importlib.import_module(f"warp_ir.{_HOME[name]}")
+        value = getattr(home, name)
         globals()[name] = value
         return value
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
+import warp_ir as ir
 from warp_ir.cli.arguments import given_settings, settings_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result
 from warp_ir.cli.device_choice import open_device
@@ -37,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
         check_address(*args.web)
     device = open_device(args.device, verbose=args.verbose)
     with importing():
+        _ = ir.Renderer  # by this name, its kernels are loaded without being read
         from warp_ir.view.controls import Controls
         from warp_ir.view.session import LiveView
         from warp_ir.view.source import StageSource

@@ -14,6 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_ir.device import definitions
+
 _LOGGER = logging.getLogger("warp_ir")
 
 
@@ -39,13 +41,19 @@ class ModuleLoader:
         if module in self._loaded:
             return
         self.expect([module])
-        compiles = not self._is_cached(module)
+        by_record = self._device.is_cpu and definitions.load(module)
+        if not by_record:
+            definitions.define_all()
+        compiles = not by_record and not self._is_cached(module)
         if compiles:
             with self._lock:
                 if self._began is None:
                     self._began = time.perf_counter()
                     self._say("compiling kernels, once: %d of %d modules done")
-        wp.load_module(module, device=self._device, block_dim=self._block_dim)
+        if not by_record:
+            wp.load_module(module, device=self._device, block_dim=self._block_dim)
+            if self._device.is_cpu:
+                definitions.record(module, self._device)
         with self._lock:
             self._loaded.add(module)
             self._expected.discard(module)

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import warp as wp
 
 from warp_ir.device.compiling import ModuleLoader
+from warp_ir.device.definitions import Command, defined, is_loaded
 from warp_ir.device.profiling import Profile
 from warp_ir.scene import InputError
 
@@ -169,7 +170,8 @@ class Launcher:
         self._wait_for(kernel.module)
         self._modules.load(kernel.module)
         if self.device.is_cuda or self._recording or self.device.is_capturing:
-            wp.launch(kernel, dim=count, inputs=[0, *inputs], device=self.device, block_dim=_BLOCK_DIM)
+            inputs = [0, *inputs]
+            wp.launch(defined(kernel), dim=count, inputs=inputs, device=self.device, block_dim=_BLOCK_DIM)
             return
         launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)
         launch.commands.append(self._record_command(launch))  # in this thread, which loads the module if necessary
@@ -224,7 +226,10 @@ class Launcher:
             self._uninterruptible = False
 
     def _record_command(self, launch: _Launch) -> Any:
-        return wp.launch(launch.kernel, dim=1, inputs=[0, *launch.inputs], device=self.device, record_cmd=True)
+        kernel, inputs = launch.kernel, [0, *launch.inputs]
+        if is_loaded(kernel):
+            return Command(kernel, inputs, self.device)
+        return wp.launch(defined(kernel), dim=1, inputs=inputs, device=self.device, record_cmd=True)
 
     def _wait_for_launches(self, launches: Sequence[_Launch]) -> None:
         """Runs bands until some launches are done."""

@@ -20,7 +20,6 @@ from typing import ClassVar
 import warp as wp
 
 import warp_ir.gbuffer
-import warp_ir.guiding.probes
 import warp_ir.vpl.emission
 import warp_ir.vpl.sets
 from warp_ir.device.launcher import MAX_REGISTERS
@@ -166,7 +165,7 @@ class VplEstimator:
     """VPLs with resampled visibility, bounded and compensated; light paths are guided."""
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, warp_ir.vpl.emission, warp_ir.vpl.sets)
-    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = (wavefront, warp_ir.guiding.probes)
+    WAVEFRONT_MODULES: ClassVar[Sequence[ModuleType]] = (wavefront,)
 
     def __init__(self, scene: DeviceScene, camera: CameraData, settings: ResolvedSettings, scratch: Scratch) -> None:
         """Prepares for a scene, a `CameraData` and settings; what an iteration overwrites lies in `scratch`."""
@@ -179,8 +178,6 @@ class VplEstimator:
         """The guide, once it has been learned."""
         guiding = settings.guiding
         self._first_guided = math.inf if guiding is None or not scene.emits else guiding.first_iteration
-        if settings.iteration_limit > self._first_guided:
-            self._launcher.load([warp_ir.guiding.probes])
 
     def prepare(self, iteration: int) -> Guide:
         """Uploads the numbers of an iteration, and learns the guide when it is first needed: the result."""

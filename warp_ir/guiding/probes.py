@@ -59,7 +59,7 @@ class ProbeRows:
     weight: wp.array[wp.float32]  # the pixel's radiance per irradiance over π here, mean of the channels
 
 
-@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _trace_camera_probes(
     first: int, scene: SceneData, gbuffer: GBuffer, scramble: wp.uint32, emitter_samples: int, rows: ProbeRows
 ) -> None:
@@ -189,7 +189,7 @@ def _finite(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     return np.where(np.isfinite(values), values, np.float32(0.0)).astype(np.float64)
 
 
-@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _connect_vertices(
     first: int,
     scene: SceneData,
