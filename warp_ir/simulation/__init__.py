@@ -1,0 +1,1 @@
+"""Scenes that a simulation moves, and many views of many worlds of them."""
