@@ -5,7 +5,7 @@
 
 from warp_ir.device_scene.camera_data import CameraData, camera_data
 from warp_ir.device_scene.emitter_table import FLOOR_SHARE, emitter_lifts, floored_probabilities, selection_cdf
-from warp_ir.device_scene.frame import DeviceFrame
+from warp_ir.device_scene.frame import DeviceFrame, snapped_frame_of_box
 from warp_ir.device_scene.geometry_storage import MeshBatch
 from warp_ir.device_scene.geometry_update import DeviceGeometry
 from warp_ir.device_scene.light_tables import upload_lights
@@ -29,6 +29,7 @@ __all__ = [
     "emitter_lifts",
     "floored_probabilities",
     "selection_cdf",
+    "snapped_frame_of_box",
     "upload_lights",
     "upload_scene",
     "upload_scenes",

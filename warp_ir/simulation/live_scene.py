@@ -15,6 +15,7 @@ all worlds share.
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -29,13 +30,14 @@ from warp_ir.device_scene import (
     MeshBatch,
     SceneData,
     check_scene,
+    snapped_frame_of_box,
     upload_lights,
 )
 from warp_ir.sampling import sobol
 from warp_ir.scene import Floats, Instances, InputError, Ints, Light, Material, Mesh, Scene
 from warp_ir.simulation import placement
 from warp_ir.simulation.bodies import areas, bodies_of, quaternions, rotations_and_stretches, world_balls
-from warp_ir.simulation.placement import PlacedBoxes, Placements, Prototypes, WorldFrames, WorldTargets
+from warp_ir.simulation.placement import MovingPoints, PlacedBoxes, Placements, Prototypes, WorldFrames, WorldTargets
 from warp_ir.simulation.top_tree import new_top_tree, refit_top_tree
 from warp_ir.simulation.world_emitters import new_world_emitters
 
@@ -90,6 +92,7 @@ class LiveScene:
         check_scene(scene, self.launcher, ())
         if extent is not None and not 0.0 < extent < np.inf:
             raise InputError(f"extent: must be a positive number, is {extent}")
+        self._meshes = scene.meshes
         self._bodies = bodies = bodies_of(scene, deforming)
         count = bodies.count
         group = np.zeros(count, np.int64) if worlds is None else np.asarray(worlds, np.int64)
@@ -232,39 +235,39 @@ class LiveScene:
         )
 
     def set_points(
-        self, name: str, points: "wp.array[wp.vec3]", selection: "wp.array[wp.int32] | None" = None
+        self, names: str | Sequence[str], points: "wp.array[wp.vec3]", selection: "wp.array[wp.int32] | None" = None
     ) -> None:
-        """Sets the points of a mesh that deforms, in the space of its prototype.
+        """Sets the points of a mesh that deforms, or of several at once, in the space of their prototypes.
 
         Args:
-            name: Name of the mesh.
-            points: vec3, as many as the mesh has, or a larger array from which `selection` takes them.
-            selection: int32, index into `points` of each of the mesh's points; None: they are those of the mesh.
+            names: Name of the mesh, or of meshes that follow each other in `deforming`.
+            points: vec3, one for each of their points, mesh after mesh, or any array that `selection` takes them from.
+            selection: int32, index into `points` of each of their points; None: they are in order.
 
         Raises:
             InputError: There is no such mesh, or the number of points is another.
         """
-        if name not in self._deforming:
-            raise InputError(f"{name}: is no mesh that deforms")
-        batch, frame, group = self._deforming[name]
-        count = len(batch.point_rows)
-        if (points if selection is None else selection).shape[0] != count:
-            raise InputError(f"{name}: has {count} points")
+        each = (names,) if isinstance(names, str) else names
+        if not each or any(name not in self.deforming for name in each):
+            raise InputError(f"{names}: is no mesh that deforms")
+        begin, end = self.deforming[each[0]].start, self.deforming[each[-1]].stop
+        if (points if selection is None else selection).shape[0] != end - begin:
+            raise InputError(f"{each[0]}: {end - begin} points are wanted")
         selected = self._all_rows if selection is None else selection
-        inputs = [points, selected, batch.point_rows.start, frame, self.data.points, group, self.changed]
-        self.launcher.launch(placement._set_points, count, inputs)
+        inputs = [points, selected, begin, self._moving_points, self._prototypes, self.data.points, self.changed]
+        self.launcher.launch(placement._set_points, end - begin, inputs)
 
     def set_lights(self, lights: Sequence[Light]) -> None:
         """Replaces the lights of all worlds. This is not part of a step: it works on the host."""
         bodies, launcher, frame = self._bodies, self.launcher, self.frame
         self._lights = tuple(lights)
-        scene = Scene(bodies.scene.meshes, bodies.scene.materials, self._lights)
+        scene = Scene(self._meshes, bodies.scene.materials, self._lights)  # links name its meshes
         reference = float(self._radii[0])
         self.data.centre, self.data.radius = wp.vec3(0.0), reference
         self.data.focus, self.data.focus_radius = self.data.centre, reference
         uploaded = upload_lights(scene, frame, self.data, launcher)
         firsts = self._geometry.first_triangles(0)
-        lit = _with_lights(bodies, self._lights)
+        lit = replace(bodies, scene=replace(bodies.scene, lights=self._lights))
         self._emitters = new_world_emitters(
             lit,
             self._group,
@@ -375,6 +378,7 @@ class LiveScene:
         placements.stretch = array(stretch.astype(np.float32), wp.mat33)
         placements.inverse_stretch = array(np.linalg.inv(stretch).astype(np.float32), wp.mat33)
         placements.in_device = array(np.array(bodies.emits, np.int32)[bodies.prototype], wp.int32)
+        placements.unbounded = array(self._unbounded.astype(np.int32), wp.int32)
         self._all_rows = launcher.empty(0, wp.int32)
 
         instances = empty_rows(Instance, count)
@@ -422,15 +426,17 @@ class LiveScene:
         self._moving = [batches[k] for k in moving]
         self._moving_roots = launcher.array(np.array([roots[k] for k in moving], np.int32), wp.int32)
         self._moving_rows = launcher.array(np.array(moving, np.int32), wp.int32)
-        self._deforming = {
-            bodies.names[row[k]]: (
-                batches[k],
-                wp.vec4(*batches[k].frame.origin.tolist(), batches[k].frame.scale),
-                int(self._group[row[k]]),
-            )
-            for k in moving
-            if bodies.deforms[k]
-        }
+        self.deforming: dict[str, range] = {}
+        """Of each mesh that deforms, the range of its points among those of all."""
+        deforming = [k for k in moving if bodies.deforms[k]]
+        counts = [len(batches[k].point_rows) for k in deforming]
+        for k, begin, count in zip(deforming, np.cumsum([0, *counts]).tolist(), counts, strict=False):
+            self.deforming[bodies.names[row[k]]] = range(begin, begin + count)
+        self._moving_points = table = MovingPoints()
+        rows = [np.asarray(batches[k].point_rows) for k in deforming] or [np.zeros(1, np.int64)]
+        table.rows = launcher.array(np.concatenate(rows).astype(np.int32), wp.int32)
+        table.prototype = launcher.array(np.repeat(deforming or [0], counts or [1]), wp.int32)
+        table.group = launcher.array(np.repeat(self._group[row[deforming]] if deforming else [0], counts or [1]), wp.int32)
         self._baked = None
         baked = [k for k in moving if bodies.emits[k]]
         if baked:
@@ -443,9 +449,9 @@ class LiveScene:
             self._baked = array(instance, wp.int32), array(used.astype(np.float32), wp.vec3), array(rows, wp.int32)
         if not moving or launcher.device.is_cuda:
             return
-        children, continues = data.bvh.children.numpy(), data.bvh.continues
-        del continues
-        blocks, levels = [], {}
+        children = data.bvh.children.numpy()
+        blocks: list[Ints] = []
+        levels: dict[int, list[int]] = {}
         boxes = data.bvh.nodes.numpy().reshape(len(children), 6, -1)
         used_lane = boxes[:, 0] <= boxes[:, 3]
         for batch in self._moving:
@@ -507,13 +513,5 @@ class LiveScene:
 
 
 def _frame_of(balls: Floats) -> DeviceFrame:
-    from warp_ir.device_scene.frame import snapped_frame_of_box
-
-    lower, upper = (balls[:, :3] - balls[:, 3:]).min(axis=0), (balls[:, :3] + balls[:, 3:]).max(axis=0)
-    return snapped_frame_of_box(lower, upper)
-
-
-def _with_lights(bodies: "Bodies", lights: tuple[Light, ...]) -> "Bodies":
-    from dataclasses import replace
-
-    return replace(bodies, scene=replace(bodies.scene, lights=lights))
+    """The frame in which balls [n, 4] fill a unit box."""
+    return snapped_frame_of_box((balls[:, :3] - balls[:, 3:]).min(axis=0), (balls[:, :3] + balls[:, 3:]).max(axis=0))

@@ -35,6 +35,7 @@ class Placements:
     stretch: wp.array[wp.mat33]  # body from prototype: scale and shear, a constant
     inverse_stretch: wp.array[wp.mat33]
     in_device: wp.array[wp.int32]  # 1: the points of its prototype are in the device frame already
+    unbounded: wp.array[wp.int32]  # 1: much larger than what happens around it
 
 
 @wp.struct
@@ -119,28 +120,39 @@ def _color_instances(
         changed[placements.group[i]] = 1
 
 
+@wp.struct
+class MovingPoints:
+    """The points of all meshes that deform, mesh after mesh."""
+
+    rows: wp.array[wp.int32]  # in the table of points
+    prototype: wp.array[wp.int32]
+    group: wp.array[wp.int32]
+
+
 @wp.kernel
 def _set_points(
     first: int,
     source: wp.array[wp.vec3],
     selection: wp.array[wp.int32],
-    first_row: int,
-    frame: wp.vec4,
+    begin: int,
+    moving: MovingPoints,
+    prototypes: Prototypes,
     points: wp.array[wp.vec3],
-    group: int,
     changed: wp.array[wp.int32],
 ) -> None:
-    """Writes a point of a prototype in its own frame (x, y, z of the origin, scale); a selection lists the sources."""
+    """Writes a point in its prototype's own frame, the origin if it is not finite; a selection lists the sources."""
     k = first + wp.tid()
     i = k
     if selection.shape[0] > 0:
         i = selection[k]
-    p = (source[i] - wp.vec3(frame[0], frame[1], frame[2])) * frame[3]
+    row = moving.rows[begin + k]
+    prototype = moving.prototype[begin + k]
+    p = (source[i] - prototypes.origin[prototype]) * prototypes.scale[prototype]
     if not wp.isfinite(p[0] + p[1] + p[2]):
         p = wp.vec3(0.0)
-    if not (points[first_row + k] == p):
-        points[first_row + k] = p
-        changed[group] = 1
+    if not (points[row] == p):
+        points[row] = p
+        changed[moving.group[begin + k]] = 1
 
 
 @wp.kernel
@@ -227,6 +239,9 @@ def _place_instances(
                 back[row] += wp.abs(inverse[row, column]) * farthest[column]
         for row in range(3):
             magnitude = wp.max(magnitude, wp.dot(wp.abs(axes[row]), back))
+        if placements.unbounded[i] == 1:
+            # Rounding is bounded by the coordinates of the triangle that is hit, which users of `magnitude` add.
+            magnitude = 0.0
         magnitude += wp.max(wp.abs(centre))
         middle = axes * middle + centre
         if wp.length(middle - worlds.focus[group]) < worlds.reach[group]:
