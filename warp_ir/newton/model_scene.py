@@ -152,7 +152,9 @@ class _Builder:
                 matrices[k] = pose @ np.diag([*stretch[k], 1.0])
             if kind == newton.GeoType.PLANE and not (scales[rows[0]][:2] > 0.0).all():
                 self._unbounded += range(len(shape), len(shape) + len(rows))
-            self._add(f"shapes {len(self._groups)}", triangles, matrices, worlds[rows], np.array(rows), self._material(image))
+            self._add(
+                f"shapes {len(self._groups)}", triangles, matrices, worlds[rows], np.array(rows), self._material(image)
+            )
             shape += rows
         self._shape = np.array(shape, np.int64)
 
@@ -217,9 +219,7 @@ class _Builder:
             uvs = None if mesh.uvs is None else mesh.uvs.numpy().reshape(-1, 2)[triangles].astype(np.float32)
             vertices = np.arange(*ranges[k])
             colors = np.ones((len(triangles), 3))
-            self._add_surface(
-                1, f"skinned {k}", points, triangles, world, vertices, colors, uvs, self._material(image)
-            )
+            self._add_surface(1, f"skinned {k}", points, triangles, world, vertices, colors, uvs, self._material(image))
 
     def result(self) -> ModelScene:
         """What has been added."""

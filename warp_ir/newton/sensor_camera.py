@@ -261,9 +261,7 @@ class SensorCamera:
         self._ground = self._sky if ground_color is None else tuple(float(c) for c in ground_color)
         self._forget_lights()
 
-    def assign_checkerboard_material(
-        self, *, shape_indices: Any, resolution: int = 64, checker_size: int = 32
-    ) -> None:
+    def assign_checkerboard_material(self, *, shape_indices: Any, resolution: int = 64, checker_size: int = 32) -> None:
         """Gives selected shapes a grey checkerboard, and all others no texture; shown if textures are enabled."""
         rows = np.asarray(shape_indices, np.int64).reshape(-1)
         if ((rows < 0) | (rows >= self.model.shape_count)).any():
@@ -428,7 +426,7 @@ class SensorCamera:
             up[int(self.model.up_axis)] = 1.0
             frame = _frame_with_y(up)
             if self._sky == self._ground:
-                out.append(Light("ambient", LightKind.DOME, self._sky, world_from_light=frame))  # type: ignore[arg-type]  # three
+                out.append(Light("ambient", LightKind.DOME, self._sky, world_from_light=frame))
             else:
                 halves = np.repeat(np.array([self._sky, self._ground], np.float32), _DOME_ROWS // 2, axis=0)
                 texture = np.repeat(halves[:, None], 2, axis=1)

@@ -11,7 +11,7 @@ SEGMENTS = 128
 """Segments around the axis of curved shapes."""
 PLANE_REACH = 4096.0
 """Half the size of an infinite plane [m]: further than camera rays go by default."""
-_PLANE_RINGS = 16
+_PLANE_SQUARES = 16
 _PLANE_SIDE = 8
 
 
@@ -45,20 +45,21 @@ def plane(width: float, length: float) -> Triangles:
     if width > 0.0 and length > 0.0:
         x, y = 0.5 * width, 0.5 * length
         return Triangles(
-            np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+            np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]),
+            np.array([[0, 1, 2], [0, 2, 3]], np.int32),
         )
     steps = np.linspace(-1.0, 1.0, _PLANE_SIDE, endpoint=False)
     ones = np.ones(_PLANE_SIDE)
     square = np.concatenate(
         [np.stack(side, axis=1) for side in ((steps, -ones), (ones, steps), (-steps, ones), (-ones, -steps))]
     )
-    rings = [square * PLANE_REACH * 0.5**k for k in reversed(range(_PLANE_RINGS))]
-    flat = np.concatenate([np.zeros((1, 2)), *rings])
+    squares = [square * PLANE_REACH * 0.5**k for k in reversed(range(_PLANE_SQUARES))]
+    flat = np.concatenate([np.zeros((1, 2)), *squares])
     n = len(square)
     inner = [(0, 1 + k, 1 + (k + 1) % n) for k in range(n)]
     outer = [
         t
-        for ring in range(len(rings) - 1)
+        for ring in range(len(squares) - 1)
         for k in range(n)
         for a, b in [(1 + ring * n + k, 1 + ring * n + (k + 1) % n)]
         for t in ((a, a + n, b + n), (a, b + n, b))
@@ -79,9 +80,7 @@ def sphere() -> Triangles:
 def capsule(radius: float, half_height: float) -> Triangles:
     """A cylinder along Z with hemispheres at its ends."""
     theta = np.linspace(0.0, 0.5 * math.pi, SEGMENTS // 4 + 1)
-    top = np.stack(
-        [radius * np.cos(theta), half_height + radius * np.sin(theta), np.cos(theta), np.sin(theta)], axis=1
-    )
+    top = np.stack([radius * np.cos(theta), half_height + radius * np.sin(theta), np.cos(theta), np.sin(theta)], axis=1)
     bottom = top[::-1] * np.array([1.0, -1.0, 1.0, -1.0])
     return _lathe([np.concatenate([bottom, top])])
 
@@ -138,7 +137,9 @@ def _lathe(profiles: list[Floats]) -> Triangles:
         triangles.append(own + first)
         normals.append(at_corner)
         first += len(flat)
-    return Triangles(np.concatenate(points), np.concatenate(triangles).astype(np.int32), np.concatenate(normals).astype(np.float32))
+    return Triangles(
+        np.concatenate(points), np.concatenate(triangles).astype(np.int32), np.concatenate(normals).astype(np.float32)
+    )
 
 
 def _average_at_tips(triangles: Ints, points: Floats, normals: Floats) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warp_ir.scene import Floats, InputError, Instances, Ints, Mesh, Scene, materials_of, triangle_areas
+from warp_ir.scene import Bools, Floats, InputError, Instances, Ints, Mesh, Scene, materials_of, triangle_areas
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def balls(bodies: Bodies) -> Floats:
         return np.concatenate([centre, (0.5 * np.linalg.norm(upper - lower, axis=1) * stretch)[:, None]], axis=1)
 
 
-def world_balls(bodies: Bodies, group: Ints, world_count: int, bounded: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> Floats:
+def world_balls(bodies: Bodies, group: Ints, world_count: int, bounded: Bools) -> Floats:
     """The ball of details of each world, and last of what all worlds share: x, y, z, radius; [worlds + 1, 4].
 
     It holds the world's bounded bodies. A world without any has that of the shared ones.

@@ -16,6 +16,7 @@ all worlds share.
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -34,7 +35,7 @@ from warp_ir.device_scene import (
     upload_lights,
 )
 from warp_ir.sampling import sobol
-from warp_ir.scene import Floats, Instances, InputError, Ints, Light, Material, Mesh, Scene
+from warp_ir.scene import Bools, Floats, InputError, Instances, Ints, Light, Material, Mesh, Scene
 from warp_ir.simulation import placement
 from warp_ir.simulation.bodies import areas, bodies_of, quaternions, rotations_and_stretches, world_balls
 from warp_ir.simulation.placement import MovingPoints, PlacedBoxes, Placements, Prototypes, WorldFrames, WorldTargets
@@ -103,7 +104,7 @@ class LiveScene:
         self.names = bodies.names
         """Name of each instance [n]: that of its mesh, or of its `Instances`."""
         self._group = np.where(group < 0, world_count, group)
-        self._unbounded = np.zeros(count, bool)
+        self._unbounded: Bools = np.zeros(count, bool)
         self._unbounded[list(unbounded)] = True
         balls = world_balls(bodies, self._group, world_count, ~self._unbounded)
         self.frame = frame or _frame_of(balls)
@@ -204,9 +205,7 @@ class LiveScene:
         """The rows of the instances of a name."""
         return [row for row, own in enumerate(self.names) if own == name]
 
-    def set_transforms(
-        self, transforms: "wp.array[wp.transformf]", rows: "wp.array[wp.int32] | None" = None
-    ) -> None:
+    def set_transforms(self, transforms: "wp.array[wp.transformf]", rows: "wp.array[wp.int32] | None" = None) -> None:
         """Moves instances: world from body, where scale and shear that an instance began with stay.
 
         Args:
@@ -231,7 +230,13 @@ class LiveScene:
         self.launcher.launch(
             placement._color_instances,
             count,
-            [self._all_rows if rows is None else rows, colors, self.placements, self.data.instance_colors, self.changed],
+            [
+                self._all_rows if rows is None else rows,
+                colors,
+                self.placements,
+                self.data.instance_colors,
+                self.changed,
+            ],
         )
 
     def set_points(
@@ -343,7 +348,7 @@ class LiveScene:
         inputs = [self._moving_roots, self._moving_rows, data.bvh, self._prototypes]
         launcher.launch(placement._read_prototype_boxes, len(self._moving), inputs)
 
-    def _check_rows(self, values: "wp.array", rows: "wp.array[wp.int32] | None") -> int:
+    def _check_rows(self, values: Any, rows: "wp.array[wp.int32] | None") -> int:
         count = self.count if rows is None else int(rows.shape[0])
         if values.shape[0] != count:
             raise InputError(f"{values.shape[0]} values for {count} instances")
@@ -365,7 +370,7 @@ class LiveScene:
         prototypes.lower, prototypes.upper = array(-half, wp.vec3), array(half, wp.vec3)
 
         count = bodies.count
-        finite = np.isfinite(bodies.matrices).all(axis=(1, 2))
+        finite: Bools = np.asarray(np.isfinite(bodies.matrices).all(axis=(1, 2)))
         matrices = np.where(finite[:, None, None], bodies.matrices, np.eye(4))
         rotation, stretch = rotations_and_stretches(matrices[:, :3, :3])
         if count and not (np.abs(np.linalg.det(stretch)) > 0.0).all():
@@ -436,29 +441,31 @@ class LiveScene:
         rows = [np.asarray(batches[k].point_rows) for k in deforming] or [np.zeros(1, np.int64)]
         table.rows = launcher.array(np.concatenate(rows).astype(np.int32), wp.int32)
         table.prototype = launcher.array(np.repeat(deforming or [0], counts or [1]), wp.int32)
-        table.group = launcher.array(np.repeat(self._group[row[deforming]] if deforming else [0], counts or [1]), wp.int32)
+        table.group = launcher.array(
+            np.repeat(self._group[row[deforming]] if deforming else [0], counts or [1]), wp.int32
+        )
         self._baked = None
         baked = [k for k in moving if bodies.emits[k]]
         if baked:
             points = [m.points for k in baked for m in bodies.meshes(k)]
             instance = np.repeat(row[baked], [len(batches[k].point_rows) for k in baked])
-            rows = np.concatenate([np.asarray(batches[k].point_rows) for k in baked])
+            point_rows = np.concatenate([np.asarray(batches[k].point_rows) for k in baked])
             used = np.concatenate(points)
             used = np.where(np.isfinite(used).all(axis=1, keepdims=True), used, 0.0)
             array = launcher.array
-            self._baked = array(instance, wp.int32), array(used.astype(np.float32), wp.vec3), array(rows, wp.int32)
+            self._baked = array(instance, wp.int32), array(used.astype(np.float32), wp.vec3), array(point_rows, wp.int32)
         if not moving or launcher.device.is_cuda:
             return
         children = data.bvh.children.numpy()
         blocks: list[Ints] = []
         levels: dict[int, list[int]] = {}
         boxes = data.bvh.nodes.numpy().reshape(len(children), 6, -1)
+        height = np.zeros(len(children), np.int64)
         used_lane = boxes[:, 0] <= boxes[:, 3]
         for batch in self._moving:
             nodes, own_blocks = self._geometry.tree_ranges(batch)
             offset = np.full(len(own_blocks), batch.triangle_rows.start)
             blocks.append(np.stack([np.asarray(own_blocks), offset], axis=1))
-            height = np.zeros(nodes.stop, np.int64)
             for node in reversed(nodes):  # a node is stored before its children
                 below = children[node][used_lane[node] & (children[node] >= 0)]
                 height[node] = 1 + height[below].max() if len(below) else 0
@@ -490,7 +497,7 @@ class LiveScene:
         self.worlds.assign(launcher.array(rows, SceneData))
         self.changed.fill_(1)
 
-    def _new_two_level(self) -> "wp.array[TwoLevel]":
+    def _new_two_level(self) -> Any:
         """Both levels of each world: the same tables, and a root of its own."""
         launcher, count = self.launcher, self.world_count
         tree = InstanceTree()

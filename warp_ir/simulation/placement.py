@@ -62,10 +62,16 @@ class PlacedBoxes:
 
 @wp.func
 def is_finite(t: wp.transformf) -> bool:
-    """Whether a pose has neither NaN nor infinity."""
+    """Whether a pose has neither NaN nor infinity, and a rotation."""
     p = wp.transform_get_translation(t)
-    q = wp.transform_get_rotation(t)
-    return wp.isfinite(p[0] + p[1] + p[2]) and wp.isfinite(q[0] + q[1] + q[2] + q[3])
+    squared = wp.length_sq(wp.transform_get_rotation(t))
+    return wp.isfinite(p[0] + p[1] + p[2]) and wp.isfinite(squared) and squared > 0.0
+
+
+@wp.func
+def rotation_of(t: wp.transformf) -> wp.mat33:
+    """The rotation of a pose, whatever the length of its quaternion, which drifts in simulations."""
+    return wp.quat_to_matrix(wp.normalize(wp.transform_get_rotation(t)))
 
 
 @wp.func
@@ -174,7 +180,8 @@ def _bake_points(
     pose = placements.transforms[i]
     p = wp.vec3(0.0)
     if is_finite(pose):
-        p = (wp.transform_point(pose, placements.stretch[i] * rest[k]) - worlds.origin) * worlds.scale
+        local = rotation_of(pose) * (placements.stretch[i] * rest[k])
+        p = (local + wp.transform_get_translation(pose) - worlds.origin) * worlds.scale
         if wp.length(p - worlds.focus[placements.group[i]]) > worlds.reach[placements.group[i]]:
             p = wp.vec3(0.0)
     points[point_rows[k]] = p
@@ -219,7 +226,7 @@ def _place_instances(
     key = int(_LAST_KEY)
     if is_finite(pose):
         if placements.in_device[i] == 0:
-            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            rotation = rotation_of(pose)
             stretch = rotation * placements.stretch[i]
             own_scale = prototypes.scale[k]
             axes = stretch * (worlds.scale / own_scale)

@@ -8,6 +8,7 @@ launches, whose number grows with the logarithm of the number of instances.
 A world's tree and the shared one meet in the world's root: a ray starts there and sees both.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,7 +107,7 @@ def _refit_nodes(
 
 
 def new_top_tree(group: Ints, world_count: int, launcher: Launcher) -> TopTree:
-    """The trees over instances of given groups [n]: worlds 0 ... world_count - 1, and `world_count` for the shared one."""
+    """The trees over instances of given groups [n]: worlds 0 ... `world_count` - 1, and that for what all share."""
     counts = np.bincount(group, minlength=world_count + 1)
     first_rows = np.concatenate([[0], np.cumsum(counts)])
     levels: list[list[npt.NDArray[np.int64]]] = []  # by height, the children of each node, as (height, number) or leaf
@@ -151,7 +152,7 @@ def new_top_tree(group: Ints, world_count: int, launcher: Launcher) -> TopTree:
     tree.nodes, tree.children = launcher.zeros(6 * len(children), vec8), launcher.array(children, vec8i)
     tree.leaf_instances = launcher.empty(2 * max(len(group), 1), wp.int32)  # the radix sort needs twice the memory
     tree.continues = launcher.zeros(max(len(group), 1), wp.int32)
-    ranges = [range(int(a), int(b)) for a, b in zip(first_nodes[:-1], first_nodes[1:], strict=True)]
+    ranges = [range(int(a), int(b)) for a, b in itertools.pairwise(first_nodes)]
     return TopTree(
         tree=tree,
         roots=_numbers(np.array(names, np.int64), first_nodes).astype(np.int32),

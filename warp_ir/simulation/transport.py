@@ -245,7 +245,9 @@ def _store_world_paths(
     for k in range(wp.min(lengths[i], settings.recorded)):
         row = surface_row(settings, number + k, total)
         if row >= 0:
-            copy_vpl(source, settings.on_lights + settings.paths * k + path, buffer, row, thinning_weight(settings, total))
+            copy_vpl(
+                source, settings.on_lights + settings.paths * k + path, buffer, row, thinning_weight(settings, total)
+            )
     if path < settings.on_lights:
         copy_vpl(source, path, buffer, path, 1.0)
         buffer.pdf_area[path] = source.pdf_area[path]
@@ -391,7 +393,9 @@ def _pixel_world(views: ViewRays, paths: WorldPaths, pixel: int) -> int:
 
 
 @wp.func
-def _write_nearest(views: ViewRays, view: int, pixel: int, ids: wp.array[wp.uint32], seen: ViewHit, n: wp.vec3, out: Outputs) -> None:
+def _write_nearest(
+    views: ViewRays, view: int, pixel: int, ids: wp.array[wp.uint32], seen: ViewHit, n: wp.vec3, out: Outputs
+) -> None:
     """Writes the outputs that are those of the nearest sample of a pixel."""
     if out.depth.shape[0] > 0:
         out.depth[pixel] = seen.hit.t / views.scale

@@ -134,20 +134,20 @@ class Views:
     def render(
         self,
         transforms: "wp.array[wp.transformf]",
-        rays: "wp.array4d[wp.vec3]",
+        rays: Any,
         worlds: "wp.array[wp.int32] | None" = None,
         *,
         settings: ViewSettings | None = None,
         clear: ClearValues | None = None,
         step: "int | wp.array[wp.int32] | None" = None,
-        color: "wp.array3d[wp.uint32] | None" = None,
-        hdr_color: "wp.array3d[wp.vec3] | None" = None,
-        albedo: "wp.array3d[wp.uint32] | None" = None,
-        depth: "wp.array3d[wp.float32] | None" = None,
-        forward_depth: "wp.array3d[wp.float32] | None" = None,
-        normal: "wp.array3d[wp.vec3] | None" = None,
-        shape_index: "wp.array3d[wp.uint32] | None" = None,
-        error: "wp.array3d[wp.float32] | None" = None,
+        color: Any = None,
+        hdr_color: Any = None,
+        albedo: Any = None,
+        depth: Any = None,
+        forward_depth: Any = None,
+        normal: Any = None,
+        shape_index: Any = None,
+        error: Any = None,
     ) -> None:
         """Renders all views into the arrays that are given; row 0 is at the top.
 
@@ -270,7 +270,7 @@ class Views:
     def _select(self, worlds: Any, views: ViewRays, settings: ViewSettings, shape: tuple[int, ...]) -> None:
         """Gives the worlds that are shown their slots, and notes which views have not changed."""
         scratch, launcher, scene = self._scratch, self.launcher, self.scene
-        count = scene.world_count
+        count, rays_shape = scene.world_count, (*shape[1:], views.samples, 2)
         slots = min(shape[0], count)
         ends = scratch.array("ends of worlds", count, wp.int32)[:count]
         paths = self._paths
@@ -288,8 +288,8 @@ class Views:
         history.version = scratch.array("history.version", shape[0], wp.int32)
         history.rays_changed = scratch.array("history.rays_changed", shape[1], wp.int32)
         if history.accumulates:
-            total = int(np.prod(views.rays.shape))
-            history.rays = scratch.array("history.rays", total, wp.vec3)[:total].reshape(views.rays.shape)
+            total = int(np.prod(rays_shape))
+            history.rays = scratch.array("history.rays", total, wp.vec3)[:total].reshape(rays_shape)
             launcher.launch(images._compare_rays, shape[1], [views, history])
         inputs = [ends, scene.versions, views, history, scratch.array("count", shape[0], wp.int32)]
         launcher.launch(images._begin_views, shape[0], inputs)

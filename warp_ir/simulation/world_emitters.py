@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,16 +22,18 @@ class WorldEmitters:
     """Rows for each world, at least 1."""
     count: npt.NDArray[np.int32]
     """[worlds], number of emitters."""
-    cdf: "wp.array2d[wp.float32]"
-    """[worlds, width + 1]."""
-    kind: "wp.array2d[wp.int32]"
-    item: "wp.array2d[wp.int32]"
+    cdf: Any  # mypy does not know that `wp.array2d` is a type
+    """float32 [worlds, width + 1]."""
+    kind: Any
+    """int32 [worlds, width], as `SceneData.emitter_kind`."""
+    item: Any
+    """int32 [worlds, width], as `SceneData.emitter_item`."""
     static_pdf: "wp.array[wp.float32]"
     """[worlds width], area pdf of emitters whose area is constant."""
-    pdf_area: "wp.array2d[wp.float32]"
-    """[worlds, width], as it is now."""
-    light_emitter: "wp.array2d[wp.int32]"
-    """[worlds, lights]."""
+    pdf_area: Any
+    """float32 [worlds, width], as it is now."""
+    light_emitter: Any
+    """int32 [worlds, lights]."""
     triangle_emitter: "wp.array[wp.int32]"
     """One table for all worlds."""
     has_triangles: bool
@@ -115,9 +118,7 @@ def new_world_emitters(
     )
 
 
-def _triangles(
-    bodies: Bodies, first_triangles: list[int], frame_scale: float
-) -> tuple[Ints, Floats, Floats, Ints]:
+def _triangles(bodies: Bodies, first_triangles: list[int], frame_scale: float) -> tuple[Ints, Floats, Floats, Ints]:
     """Row, power, area and prototype of every emissive triangle."""
     scene: Scene = bodies.scene
     emission = np.array([m.emission for m in scene.materials], np.float64).reshape(-1, 3).mean(axis=1)
@@ -131,12 +132,12 @@ def _triangles(
         scale = abs(np.linalg.det(matrix[:3, :3])) ** (2.0 / 3.0) * frame_scale**2
         for k in scene.instances[prototype].meshes:
             mesh = scene.meshes[k]
-            glows = np.flatnonzero(emission[mesh.material] > 0.0)
-            area = triangle_areas(mesh)[glows] * scale * (2.0 if mesh.double_sided else 1.0)
-            rows.append(first_triangles[k] + glows)
+            emissive = np.flatnonzero(emission[mesh.material] > 0.0)
+            area = triangle_areas(mesh)[emissive] * scale * (2.0 if mesh.double_sided else 1.0)
+            rows.append(first_triangles[k] + emissive)
             areas.append(area)
-            powers.append(math.pi * area * emission[mesh.material[glows]])
-            sources.append(np.full(len(glows), prototype))
+            powers.append(math.pi * area * emission[mesh.material[emissive]])
+            sources.append(np.full(len(emissive), prototype))
     if not rows:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
     row, power, area, source = (np.concatenate(x) for x in (rows, powers, areas, sources))
