@@ -474,12 +474,12 @@ class _SensorScene:
         if self._shape_count:
             bodies = self._no_bodies if state.body_q is None else state.body_q
             inputs = [self._shapes, model.shape_body, model.shape_transform, bodies, live.placements, live.changed]
-            live.launcher.launch(_pose_shapes, self._shape_count, inputs)
+            live.repeat(_pose_shapes, self._shape_count, inputs)
             inputs = [self._shapes, model.shape_color, live.placements, live.data.instance_colors, live.changed]
-            live.launcher.launch(_color_shapes, self._shape_count, inputs)
+            live.repeat(_color_shapes, self._shape_count, inputs)
         if self._particle_count:
             inputs = [self._particles, state.particle_q, self._shape_count, live.placements, live.changed]
-            live.launcher.launch(_pose_particles, self._particle_count, inputs)
+            live.repeat(_pose_particles, self._particle_count, inputs)
         live.refit()
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_ir.reconstruction.filter import IrradianceLayer, normalized, rgb, similarity, tap_weight, weighted
-from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces, pixel_match_weights
+from warp_ir.reconstruction.pixel_surfaces import PLANE_DISTANCE, PixelSurfaces
 from warp_ir.simulation.placement import same_pose
 from warp_ir.simulation.transport import DISABLE_CLEAR, DISABLE_PRESERVE, Clear, Outputs, ViewRays, ViewSums
 
@@ -93,31 +93,74 @@ def _end_views(first: int, iterations: int, count: wp.array[wp.int32], step: wp.
         step[0] += 1
 
 
+@wp.struct
+class Surface:
+    """The surface of a pixel, loaded once for all of its neighbours."""
+
+    position: wp.vec3
+    normal: wp.vec3
+    footprint: float
+
+
 @wp.func
-def _local_moments(surfaces: PixelSurfaces, values: wp.array[wp.vec3], rows: int, p: int, kind: int) -> wp.vec2:
-    """Mean and variance of the mean channel around a pixel, of those that show the same surface."""
+def _surface_of(surfaces: PixelSurfaces, p: int) -> Surface:
+    out = Surface()
+    out.position = surfaces.position[p]
+    out.normal = surfaces.normal[p]
+    out.footprint = surfaces.footprint[p]
+    return out
+
+
+@wp.func
+def _match(surfaces: PixelSurfaces, own: Surface, q: int) -> wp.vec2:
+    """`pixel_match_weights` of a pixel and another: for direct and for indirect irradiance."""
+    footprint = wp.min(own.footprint, surfaces.footprint[q])
+    normal = surfaces.normal[q]
+    facing = wp.dot(own.normal, normal)
+    if footprint <= 0.0 or facing <= 0.0:
+        return wp.vec2(0.0)
+    difference = surfaces.position[q] - own.position
+    distance = wp.max(wp.abs(wp.dot(own.normal, difference)), wp.abs(wp.dot(normal, difference)))
+    facing *= facing
+    facing *= facing
+    near = wp.max(1.0 - distance / (PLANE_DISTANCE * footprint), 0.0)
+    indirect = facing * near * near
+    return wp.vec2(indirect * facing * facing * facing, indirect)
+
+
+@wp.func
+def _mean_channels(sums: ViewSums, pixel: int) -> wp.vec2:
+    direct = sums.direct[pixel]
+    indirect = sums.indirect[pixel]
+    return wp.vec2((direct[0] + direct[1] + direct[2]) / 3.0, (indirect[0] + indirect[1] + indirect[2]) / 3.0)
+
+
+@wp.func
+def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int) -> wp.vec2:
+    """Variances of the mean channel around a pixel among those that show the same surface: direct, and indirect."""
     row = p // surfaces.columns
     column = p - row * surfaces.columns
     begin = (row // rows) * rows
-    weight = float(0.0)
-    mean = float(0.0)
-    square = float(0.0)
+    surface = _surface_of(surfaces, p)
+    own = _mean_channels(sums, p)  # the others are relative to it, so that little cancels
+    weight = wp.vec2(1.0)
+    mean = wp.vec2(0.0)
+    square = wp.vec2(0.0)
     for dy in range(-2, 3):
         y = row + dy
         if y >= begin and y < begin + rows:
             for dx in range(-2, 3):
                 x = column + dx
-                if x >= 0 and x < surfaces.columns:
+                # Every other one of 5 x 5.
+                if x >= 0 and x < surfaces.columns and (dx + dy) % 2 == 0 and not (dx == 0 and dy == 0):
                     q = y * surfaces.columns + x
-                    w = float(1.0)
-                    if q != p:
-                        w = pixel_match_weights(surfaces, p, q)[kind]
-                    value = (values[q][0] + values[q][1] + values[q][2]) / 3.0
+                    w = _match(surfaces, surface, q)
+                    difference = _mean_channels(sums, q) - own
                     weight += w
-                    mean += w * value
-                    square += w * value * value
-    mean = mean / weight
-    return wp.vec2(mean, wp.max(square / weight - mean * mean, 0.0))
+                    mean += wp.cw_mul(w, difference)
+                    square += wp.cw_mul(w, wp.cw_mul(difference, difference))
+    mean = wp.cw_div(mean, weight)
+    return wp.max(wp.cw_div(square, weight) - wp.cw_mul(mean, mean), wp.vec2(0.0))
 
 
 @wp.kernel
@@ -135,10 +178,9 @@ def _begin_filter(
     scale = float(views.samples) / (float(sums.count[view] + iterations) * hits)
     direct = sums.direct[pixel] * scale
     indirect = sums.indirect[pixel] * scale
-    of_direct = _local_moments(surfaces, sums.direct, views.rows, pixel, 0)[1] * scale * scale
-    of_indirect = _local_moments(surfaces, sums.indirect, views.rows, pixel, 1)[1] * scale * scale
-    layer.direct[pixel] = wp.vec4(direct[0], direct[1], direct[2], of_direct)
-    layer.indirect[pixel] = wp.vec4(indirect[0], indirect[1], indirect[2], of_indirect)
+    variance = _local_variances(surfaces, sums, views.rows, pixel) * (scale * scale)
+    layer.direct[pixel] = wp.vec4(direct[0], direct[1], direct[2], variance[0])
+    layer.indirect[pixel] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1])
 
 
 @wp.kernel
@@ -162,6 +204,7 @@ def _filter_views(
     row = p // surfaces.columns
     column = p - row * surfaces.columns
     begin = (row // rows) * rows
+    surface = _surface_of(surfaces, p)
     direct = wp.vec4(0.0)
     indirect = wp.vec4(0.0)
     weights = wp.vec2(0.0)
@@ -175,7 +218,7 @@ def _filter_views(
                     d = source.direct[q]
                     if d[3] >= 0.0:
                         i = source.indirect[q]
-                        match = tap_weight(dx) * tap_weight(dy) * pixel_match_weights(surfaces, p, q)
+                        match = tap_weight(dx) * tap_weight(dy) * _match(surfaces, surface, q)
                         match[0] *= similarity(own_direct, d, sigmas[0])
                         match[1] *= similarity(own_indirect, i, sigmas[1])
                         direct += weighted(d, match[0])

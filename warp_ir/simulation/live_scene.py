@@ -16,12 +16,14 @@ all worlds share.
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_ir.bvh import NO_TREE, Instance, InstanceTree, TwoLevel, empty_rows
+from warp_ir.device.launch_list import LaunchList
 from warp_ir.device.launcher import Launcher, copy_record
 from warp_ir.device.records import record_rows
 from warp_ir.device_scene import (
@@ -46,6 +48,8 @@ _ANNULI = 24
 """Annuli around the ball of details at which photons are aimed: enough for a ground 10⁶ times as large."""
 _REACH = 1000.0
 """Distance from the centre of the ball of details, in its radii, at which a body drops out of its world."""
+_MOST_REPEATED = 64
+"""Launches whose packed arguments are kept."""
 _TEXTURE_PATCHES = 2**14
 """As in `device_scene.upload`."""
 
@@ -119,6 +123,10 @@ class LiveScene:
         self.versions = array(np.zeros(world_count + 1), wp.int32)
         """How often each world has changed."""
         self._textured = True
+        self.lights_version = 0
+        """How often the lights have been replaced."""
+        self._refitting: LaunchList | None = None
+        self._repeated: dict[tuple[Any, ...], LaunchList] = {}
         self.set_lights(scene.lights)
         self.refit()
 
@@ -213,7 +221,7 @@ class LiveScene:
             rows: Which instances, each once; None: all of them.
         """
         count = self._check_rows(transforms, rows)
-        self.launcher.launch(
+        self.repeat(
             placement._move_instances,
             count,
             [self._all_rows if rows is None else rows, transforms, self.placements, self.changed],
@@ -227,7 +235,7 @@ class LiveScene:
             rows: Which instances, each once; None: all of them.
         """
         count = self._check_rows(colors, rows)
-        self.launcher.launch(
+        self.repeat(
             placement._color_instances,
             count,
             [
@@ -260,7 +268,7 @@ class LiveScene:
             raise InputError(f"{each[0]}: {end - begin} points are wanted")
         selected = self._all_rows if selection is None else selection
         inputs = [points, selected, begin, self._moving_points, self._prototypes, self.data.points, self.changed]
-        self.launcher.launch(placement._set_points, end - begin, inputs)
+        self.repeat(placement._set_points, end - begin, inputs)
 
     def set_lights(self, lights: Sequence[Light]) -> None:
         """Replaces the lights of all worlds. This is not part of a step: it works on the host."""
@@ -293,6 +301,8 @@ class LiveScene:
         self.targets.focus = launcher.zeros((self.world_count, count), wp.vec4)
         self.targets.cdf = launcher.zeros((self.world_count, count * (_ANNULI + 1)), wp.float32)
         self._write_worlds()
+        self._refitting = None
+        self.lights_version += 1
 
     @property
     def lights(self) -> tuple[Light, ...]:
@@ -304,49 +314,62 @@ class LiveScene:
         if shown != self._textured:
             self._textured = shown
             self._write_worlds()
-            self._update_worlds()
+            self.refit()
 
     def refit(self) -> None:
         """Brings everything up to date that depends on poses and points: by launches alone."""
-        launcher, data = self.launcher, self.data
-        with launcher.phase("refit"):
-            if self._baked is not None:
-                inputs = [*self._baked, self.placements, self.frames, data.points]
-                launcher.launch(placement._bake_points, self._baked[0].shape[0], inputs)
-            self._refit_moving_trees()
-            inputs = [self.placements, self._prototypes, self.frames, self._boxes]
-            launcher.launch(placement._place_instances, self.count, inputs)
-            boxes = self._boxes
-            refit_top_tree(
-                self._top, self.placements.group, boxes.keys, self._sort_keys, boxes.lower, boxes.upper, launcher
-            )
-            if self._box_tree is not None:
-                self._box_tree.refit()
-            self._update_worlds()
+        if self._refitting is None:
+            self._refitting = self._refit_launches()
+        with self.launcher.phase("refit"):
+            self._refitting.run()
 
-    def _update_worlds(self) -> None:
-        launcher, emitters = self.launcher, self._emitters
+    def _refit_launches(self) -> LaunchList:
+        out, data, boxes = LaunchList(self.launcher), self.data, self._boxes
+        if self._baked is not None:
+            inputs = [*self._baked, self.placements, self.frames, data.points]
+            out.launch(placement._bake_points, self._baked[0].shape[0], inputs)
+        self._add_moving_trees(out)
+        out.launch(placement._place_instances, self.count, [self.placements, self._prototypes, self.frames, boxes])
+        refit_top_tree(self._top, self.placements.group, boxes.keys, self._sort_keys, boxes.lower, boxes.upper, out)
+        if self._box_tree is not None:
+            out.call(self._box_tree.refit)
+        self._add_world_updates(out)
+        return out
+
+    def _add_world_updates(self, out: LaunchList) -> None:
+        emitters = self._emitters
         inputs = [self.worlds, self._roots, self.frames, self.targets, self.changed, self.versions]
-        launcher.launch(placement._update_worlds, self.world_count + 1, inputs)
+        out.launch(placement._update_worlds, self.world_count + 1, inputs)
         if emitters.has_triangles:
             pdf = emitters.pdf_area.flatten()
             inputs = [self.worlds, emitters.width, TRIANGLE_EMITTER, emitters.static_pdf, pdf]
-            launcher.launch(placement._update_emitter_areas, pdf.shape[0], inputs)
+            out.launch(placement._update_emitter_areas, pdf.shape[0], inputs)
 
-    def _refit_moving_trees(self) -> None:
-        launcher, data = self.launcher, self.data
+    def _add_moving_trees(self, out: LaunchList) -> None:
+        data = self.data
         if not self._moving:
             return
-        if launcher.device.is_cuda:
+        if self.launcher.device.is_cuda:
             for batch in self._moving:
-                self._geometry.refit_boxes(batch)
+                out.call(partial(self._geometry.refit_boxes, batch))
         else:
             inputs = [self._blocks, data.points, data.indices, data.bvh]
-            launcher.launch(placement._refit_block_list, self._blocks.shape[0], inputs)
+            out.launch(placement._refit_block_list, self._blocks.shape[0], inputs)
             for nodes in self._node_levels:
-                launcher.launch(placement._refit_node_list, nodes.shape[0], [nodes, data.bvh])
+                out.launch(placement._refit_node_list, nodes.shape[0], [nodes, data.bvh])
         inputs = [self._moving_roots, self._moving_rows, data.bvh, self._prototypes]
-        launcher.launch(placement._read_prototype_boxes, len(self._moving), inputs)
+        out.launch(placement._read_prototype_boxes, len(self._moving), inputs)
+
+    def repeat(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
+        """A launch that is likely to be repeated with the same arrays; all records among its inputs are the scene's."""
+        values = (x.ptr if isinstance(x, wp.array) else x if isinstance(x, int) else id(x) for x in inputs)
+        key = (kernel, count, *values)
+        if key not in self._repeated:
+            if len(self._repeated) >= _MOST_REPEATED:
+                self._repeated.clear()
+            self._repeated[key] = LaunchList(self.launcher)
+            self._repeated[key].launch(kernel, count, inputs)
+        self._repeated[key].run()
 
     def _check_rows(self, values: Any, rows: "wp.array[wp.int32] | None") -> int:
         count = self.count if rows is None else int(rows.shape[0])
@@ -453,7 +476,11 @@ class LiveScene:
             used = np.concatenate(points)
             used = np.where(np.isfinite(used).all(axis=1, keepdims=True), used, 0.0)
             array = launcher.array
-            self._baked = array(instance, wp.int32), array(used.astype(np.float32), wp.vec3), array(point_rows, wp.int32)
+            self._baked = (
+                array(instance, wp.int32),
+                array(used.astype(np.float32), wp.vec3),
+                array(point_rows, wp.int32),
+            )
         if not moving or launcher.device.is_cuda:
             return
         children = data.bvh.children.numpy()

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.bvh import InstanceTree, vec8, vec8i
+from warp_ir.device.launch_list import LaunchList
 from warp_ir.device.launcher import Launcher
 from warp_ir.scene import Ints
 
@@ -182,7 +183,7 @@ def refit_top_tree(
     sort_keys: wp.array[wp.int64],
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
-    launcher: Launcher,
+    launches: LaunchList,
 ) -> None:
     """Sorts the instances of every group by their keys, and recomputes all boxes.
 
@@ -193,15 +194,15 @@ def refit_top_tree(
         sort_keys: Scratch memory [2 n].
         lower: Lower corners of the instances' boxes [n]; above the upper ones where an instance is absent.
         upper: Upper corners [n].
-        launcher: Runs the kernels.
+        launches: What the launches are added to.
     """
     count = group.shape[0]
     if top.largest <= _LARGEST_RANKED:
         inputs = [keys, group, top.first_rows, top.members, top.tree.leaf_instances]
-        launcher.launch(_rank_instances, count, inputs)
+        launches.launch(_rank_instances, count, inputs)
     else:
-        launcher.launch(_write_sort_keys, count, [keys, group, sort_keys, top.tree.leaf_instances])
+        launches.launch(_write_sort_keys, count, [keys, group, sort_keys, top.tree.leaf_instances])
         bits = KEY_BITS + (top.first_rows.shape[0] - 1).bit_length()
-        wp.utils.radix_sort_pairs(sort_keys, top.tree.leaf_instances, count, end_bit=bits)
+        launches.sort(sort_keys, top.tree.leaf_instances, count, bits)
     for level in top.levels:
-        launcher.launch(_refit_nodes, len(level), [level.start, top.tree, lower, upper])
+        launches.launch(_refit_nodes, len(level), [level.start, top.tree, lower, upper])

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_ir.device.launch_list import LaunchList
 from warp_ir.device.records import record_rows
 from warp_ir.device.scratch import Scratch
 from warp_ir.estimators.vpl import COMPENSATION_SHADOW_RAYS, SHADOW_RAYS
@@ -48,6 +49,8 @@ from warp_ir.vpl.sets import (
 ACCUMULATE_NAMES = ("off", "static")
 DEFAULT_BYTES = 2**28
 """Default of `Views.bytes`."""
+_MOST_CALLS = 16
+"""Calls, by their arrays and settings, whose packed arguments are kept."""
 _OUTPUTS = {
     "color": wp.uint32,
     "hdr_color": wp.vec3,
@@ -127,7 +130,9 @@ class Views:
         self._shape: tuple[int, ...] = ()
         self.step = self.launcher.zeros(1, wp.int32)
         """[1], on the device: the number of the step, on which random numbers depend; every call adds 1."""
-        self._launches = 0
+        self._calls: dict[tuple[Any, ...], LaunchList] = {}
+        self._allocations = 0
+        self._world_buffers: dict[tuple[Any, ...], _WorldBuffers] = {}
         with self.launcher.loading():
             self.launcher.load([transport, images])
 
@@ -175,7 +180,7 @@ class Views:
         Raises:
             InputError: An array has another type, shape or device.
         """
-        settings = settings or self.settings
+        settings, clear = settings or self.settings, clear or ClearValues()
         wanted = {
             "color": color,
             "hdr_color": hdr_color,
@@ -186,35 +191,59 @@ class Views:
             "shape_index": shape_index,
             "error": error,
         }
-        self._check(transforms, rays, worlds)
-        shape = (transforms.shape[0], rays.shape[0], rays.shape[1])
-        outputs = Outputs()
-        for name, dtype in _OUTPUTS.items():
-            setattr(outputs, name, self._output(name, wanted[name], dtype, shape))
-        views, clear_record = self._begin(transforms, rays, settings), _clear(clear or ClearValues(), settings)
         if step is not None:
             wp.copy(self.step, step) if isinstance(step, wp.array) else self.step.fill_(step)
-        lit = any(wanted[name] is not None for name in ("color", "hdr_color", "error"))
-        self._select(worlds, views, settings, shape)
-        sums = self._sums(shape, lit and settings.filter, error is not None)
+        arrays = (transforms, rays, worlds, *wanted.values())
+        places = tuple(None if x is None else (x.ptr, x.shape, x.strides, x.dtype, str(x.device)) for x in arrays)
+        key = (places, settings, clear, self.scene.lights_version)
+        if key not in self._calls or self._scratch.allocations != self._allocations:
+            self._check(transforms, rays, worlds)
+            shape = (transforms.shape[0], rays.shape[0], rays.shape[1])
+            outputs = Outputs()
+            for name, dtype in _OUTPUTS.items():
+                setattr(outputs, name, self._output(name, wanted[name], dtype, shape))
+            lit = any(wanted[name] is not None for name in ("color", "hdr_color", "error"))
+            launches = self._launches(transforms, rays, worlds, settings, clear, outputs, lit)
+            if self._scratch.allocations != self._allocations or len(self._calls) >= _MOST_CALLS:
+                self._calls.clear()  # arrays that they refer to may have been replaced
+            self._allocations = self._scratch.allocations
+            self._calls[key] = launches
+        self._calls[key].run()
+
+    def _launches(
+        self,
+        transforms: Any,
+        rays: Any,
+        worlds: Any,
+        settings: ViewSettings,
+        clear: ClearValues,
+        outputs: Outputs,
+        lit: bool,
+    ) -> LaunchList:
+        """What a call launches."""
+        out = LaunchList(self.launcher)
+        shape = (transforms.shape[0], rays.shape[0], rays.shape[1])
+        views, clear_record = self._begin(transforms, rays, settings), _clear(clear, settings)
+        self._select(worlds, views, settings, shape, out)
+        sums = self._sums(shape, lit and settings.filter, outputs.error.shape[0] > 0)
         samples = rays.shape[2]
         iterations = -(-settings.iterations // samples) * samples if lit else samples
-        launcher, pixels = self.launcher, shape[0] * shape[1] * shape[2]
-        gbuffer = self._gbuffer
+        pixels = shape[0] * shape[1] * shape[2]
         for iteration in range(iterations):
             views.sample = iteration % samples
             if samples > 1 or iteration == 0:
-                inputs = [self.scene.worlds, views, self.scene.ids, clear_record, gbuffer, sums, outputs]
-                with launcher.phase("primary"):
-                    launcher.launch(transport._trace_views, pixels, inputs)
+                out.phase = "primary"
+                inputs = [self.scene.worlds, views, self.scene.ids, clear_record, self._gbuffer, sums, outputs]
+                out.launch(transport._trace_views, pixels, inputs)
             if lit:
-                self._light(views, iteration, settings, shape, sums)
+                self._light(views, iteration, settings, shape, sums, out)
         layer = new_layer(*[self._scratch.array("none4", 1, wp.vec4)[:0]] * 2)
+        out.phase = "filter"
         if lit and settings.filter:
-            with launcher.phase("filter"):
-                layer = self._filter(views, sums, iterations, shape)
-        launcher.launch(images._write_images, pixels, [views, iterations, sums, layer, clear_record, outputs])
-        launcher.launch(images._end_views, shape[0], [iterations if lit else 0, sums.count, self.step])
+            layer = self._filter(views, sums, iterations, shape, out)
+        out.launch(images._write_images, pixels, [views, iterations, sums, layer, clear_record, outputs])
+        out.launch(images._end_views, shape[0], [iterations if lit else 0, sums.count, self.step])
+        return out
 
     def _check(self, transforms: Any, rays: Any, worlds: Any) -> None:
         device = self.launcher.device
@@ -246,7 +275,6 @@ class Views:
         shape = (transforms.shape[0], *rays.shape[:3])
         if shape != self._shape:
             self._shape = shape
-            pixels = shape[0] * shape[1] * shape[2]
             self._gbuffer, _ = new_gbuffer(
                 self.launcher,
                 shape[2],
@@ -257,7 +285,7 @@ class Views:
             )
             scratch.array("count", shape[0], wp.int32).zero_()
             self._used = self.launcher.zeros(scene.world_count, wp.int32)
-            del pixels
+            self._calls.clear()
         views = ViewRays()
         views.transforms, views.rays = transforms, rays
         views.world = scratch.array("views.world", shape[0], wp.int32)[: shape[0]]
@@ -267,20 +295,22 @@ class Views:
         views.origin, views.scale = wp.vec3(*scene.frame.origin.tolist()), scene.frame.scale
         return views
 
-    def _select(self, worlds: Any, views: ViewRays, settings: ViewSettings, shape: tuple[int, ...]) -> None:
+    def _select(
+        self, worlds: Any, views: ViewRays, settings: ViewSettings, shape: tuple[int, ...], out: LaunchList
+    ) -> None:
         """Gives the worlds that are shown their slots, and notes which views have not changed."""
-        scratch, launcher, scene = self._scratch, self.launcher, self.scene
+        scratch, scene = self._scratch, self.scene
         count, rays_shape = scene.world_count, (*shape[1:], views.samples, 2)
         slots = min(shape[0], count)
         ends = scratch.array("ends of worlds", count, wp.int32)[:count]
         paths = self._paths
         paths.world_of_slot = scratch.array("world of slot", slots, wp.int32)
         paths.slot_count = scratch.array("slot count", 1, wp.int32)
-        self._used.zero_()
+        out.call(self._used.zero_)
         wanted = scratch.array("none.worlds", 1, wp.int32)[:0] if worlds is None else worlds
-        launcher.launch(images._select_worlds, shape[0], [wanted, count, views, self._used])
-        wp.utils.array_scan(self._used, ends, inclusive=True)
-        launcher.launch(transport._list_worlds, count, [self._used, ends, paths])
+        out.launch(images._select_worlds, shape[0], [wanted, count, views, self._used])
+        out.scan(self._used, ends)
+        out.launch(transport._list_worlds, count, [self._used, ends, paths])
         history = ViewHistory()
         history.accumulates = int(settings.accumulate != "off")
         history.transforms = scratch.array("history.transforms", shape[0], wp.transformf)
@@ -290,9 +320,9 @@ class Views:
         if history.accumulates:
             total = int(np.prod(rays_shape))
             history.rays = scratch.array("history.rays", total, wp.vec3)[:total].reshape(rays_shape)
-            launcher.launch(images._compare_rays, shape[1], [views, history])
+            out.launch(images._compare_rays, shape[1], [views, history])
         inputs = [ends, scene.versions, views, history, scratch.array("count", shape[0], wp.int32)]
-        launcher.launch(images._begin_views, shape[0], inputs)
+        out.launch(images._begin_views, shape[0], inputs)
 
     def _sums(self, shape: tuple[int, ...], filtered: bool, error: bool) -> ViewSums:
         scratch, pixels = self._scratch, shape[0] * shape[1] * shape[2]
@@ -315,10 +345,16 @@ class Views:
         return sums
 
     def _light(
-        self, views: ViewRays, iteration: int, settings: ViewSettings, shape: tuple[int, ...], sums: ViewSums
+        self,
+        views: ViewRays,
+        iteration: int,
+        settings: ViewSettings,
+        shape: tuple[int, ...],
+        sums: ViewSums,
+        out: LaunchList,
     ) -> None:
         """One iteration: the VPLs of every world in view, and what every pixel receives of them."""
-        launcher, scene, paths = self.launcher, self.scene, self._paths
+        scene, paths = self.scene, self._paths
         slots = min(shape[0], scene.world_count)
         buffers = self._buffers(settings, slots)
         paths.paths, paths.slots = settings.light_paths, buffers.slots
@@ -333,31 +369,31 @@ class Views:
         rows = buffers.slots * buffers.rows
         for first_slot in range(0, slots, buffers.slots):
             paths.first_slot = first_slot
-            with launcher.phase("emission"):
-                launcher.launch(transport._scramble_slots, buffers.slots, [paths])
-                inputs = [scene.worlds, paths, buffers.lengths, buffers.ends, buffers.traced]
-                launcher.launch(transport._trace_world_paths, count, inputs)
-                wp.utils.array_scan(buffers.lengths, buffers.ends, inclusive=True)
-                inputs = [scene.worlds, paths, buffers.traced, buffers.lengths, buffers.ends, buffers.vpls]
-                launcher.launch(transport._store_world_paths, count, inputs)
-                if buffers.settings.recorded < buffers.settings.max_bounces:
-                    paths.settings.again = 1
-                    inputs = [scene.worlds, paths, buffers.lengths, buffers.ends, buffers.vpls]
-                    launcher.launch(transport._trace_world_paths, count, inputs)
-                    paths.settings.again = 0
-                inputs = [scene.worlds, paths, buffers.max_sets, buffers.keys, buffers.order, buffers.sets]
-                launcher.launch(transport._divide_worlds, rows, inputs)
-                bits = transport.KEY_BITS + (buffers.slots - 1).bit_length()
-                wp.utils.radix_sort_pairs(buffers.keys, buffers.order, rows, end_bit=bits)
-                inputs = [scene.worlds, paths, buffers.blocks, buffers.slotted, buffers.sets]
-                each = max(buffers.blocks, buffers.slotted)
-                launcher.launch(transport._pack_worlds, buffers.slots * each, inputs)
-            with launcher.phase("gather"):
-                inputs = [scene.worlds, views, paths, self._gbuffer, buffers.sets, gathering, sums]
-                launcher.launch(transport._gather_views, shape[0] * shape[1] * shape[2], inputs)
+            out.phase = "emission"
+            out.launch(transport._scramble_slots, buffers.slots, [paths])
+            inputs = [scene.worlds, paths, buffers.lengths, buffers.ends, buffers.traced]
+            out.launch(transport._trace_world_paths, count, inputs)
+            out.scan(buffers.lengths, buffers.ends)
+            inputs = [scene.worlds, paths, buffers.traced, buffers.lengths, buffers.ends, buffers.vpls]
+            out.launch(transport._store_world_paths, count, inputs)
+            if buffers.settings.recorded < buffers.settings.max_bounces:
+                paths.settings.again = 1
+                inputs = [scene.worlds, paths, buffers.lengths, buffers.ends, buffers.vpls]
+                out.launch(transport._trace_world_paths, count, inputs)
+                paths.settings.again = 0
+            inputs = [scene.worlds, paths, buffers.max_sets, buffers.keys, buffers.order, buffers.sets]
+            out.launch(transport._divide_worlds, rows, inputs)
+            out.sort(buffers.keys, buffers.order, rows, transport.KEY_BITS + (buffers.slots - 1).bit_length())
+            inputs = [scene.worlds, paths, buffers.blocks, buffers.slotted, buffers.sets]
+            out.launch(transport._pack_worlds, buffers.slots * max(buffers.blocks, buffers.slotted), inputs)
+            out.phase = "gather"
+            inputs = [scene.worlds, views, paths, self._gbuffer, buffers.sets, gathering, sums]
+            out.launch(transport._gather_views, shape[0] * shape[1] * shape[2], inputs)
 
-    def _filter(self, views: ViewRays, sums: ViewSums, iterations: int, shape: tuple[int, ...]) -> IrradianceLayer:
-        launcher, scratch, gbuffer = self.launcher, self._scratch, self._gbuffer
+    def _filter(
+        self, views: ViewRays, sums: ViewSums, iterations: int, shape: tuple[int, ...], out: LaunchList
+    ) -> IrradianceLayer:
+        scratch, gbuffer = self._scratch, self._gbuffer
         pixels = shape[0] * shape[1] * shape[2]
         surfaces = PixelSurfaces()
         surfaces.columns, surfaces.rows = shape[2], shape[0] * shape[1]
@@ -367,18 +403,19 @@ class Views:
             new_layer(scratch.array(f"direct {k}", pixels, wp.vec4), scratch.array(f"indirect {k}", pixels, wp.vec4))
             for k in range(2)
         ]
-        launcher.launch(images._begin_filter, pixels, [views, surfaces, iterations, sums, layers[0]])
+        out.launch(images._begin_filter, pixels, [views, surfaces, iterations, sums, layers[0]])
         for level in range(LEVELS):
             sigmas = wp.vec2(*(sigma * SIGMA_DECAY**level for sigma in SIGMAS))
-            launcher.launch(images._filter_views, pixels, [shape[1], surfaces, *layers, 1 << level, sigmas])
+            out.launch(images._filter_views, pixels, [shape[1], surfaces, *layers, 1 << level, sigmas])
             layers.reverse()
         return layers[0]
 
     def _buffers(self, settings: ViewSettings, slots: int) -> "_WorldBuffers":
-        key = settings.light_paths, settings.max_bounces, slots
-        if getattr(self, "_buffer_key", None) != key:
-            self._buffer_key, self._world_buffers = key, _WorldBuffers(self.scene, settings, slots, self._bytes)
-        return self._world_buffers
+        data = self.scene.data
+        key = settings.light_paths, settings.max_bounces, slots, data.shaped_count > 0, data.modifier_count > 0
+        if key not in self._world_buffers:
+            self._world_buffers[key] = _WorldBuffers(self.scene, settings, slots, self._bytes)
+        return self._world_buffers[key]
 
 
 class _WorldBuffers:
