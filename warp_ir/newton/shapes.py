@@ -13,6 +13,7 @@ PLANE_REACH = 4096.0
 """Half the size of an infinite plane [m]: further than camera rays go by default."""
 _PLANE_SQUARES = 16
 _PLANE_SIDE = 8
+_SMALL_PLANE = 4.0
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ def box() -> Triangles:
 def plane(width: float, length: float) -> Triangles:
     """A plane at z = 0 that faces +Z; a size of 0 is infinite.
 
-    What is infinite grows by squares, each twice as wide as the last: so triangles are small where things happen, and
+    What is large grows by squares, each twice as wide as the last: so triangles are small where things happen, and
     positions on them are precise.
     """
-    if width > 0.0 and length > 0.0:
+    if 0.0 < max(width, length) <= _SMALL_PLANE and min(width, length) > 0.0:
         x, y = 0.5 * width, 0.5 * length
         return Triangles(
             np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]),

@@ -164,6 +164,27 @@ def balls(bodies: Bodies) -> Floats:
         return np.concatenate([centre, (0.5 * np.linalg.norm(upper - lower, axis=1) * stretch)[:, None]], axis=1)
 
 
+_MUCH_LARGER = 8.0
+"""Radius of a body, relative to the ball around all smaller ones of its world, from which on it is a background."""
+
+
+def backgrounds(bodies: Bodies, group: Ints, groups: int) -> Bools:
+    """Which instances are much larger than what happens in their world, as grounds and backdrops are, bool [n]."""
+    every = balls(bodies)
+    out = np.zeros(bodies.count, bool)
+    for g in range(groups):
+        rows = np.flatnonzero((group == g) & np.isfinite(every).all(axis=1))
+        rows = rows[np.argsort(every[rows, 3], kind="stable")]
+        own = every[rows]
+        lower = np.minimum.accumulate(own[:, :3] - own[:, 3:], axis=0)
+        upper = np.maximum.accumulate(own[:, :3] + own[:, 3:], axis=0)
+        radius = 0.5 * np.linalg.norm(upper - lower, axis=1)
+        larger = np.flatnonzero(own[1:, 3] > _MUCH_LARGER * radius[:-1])
+        if len(larger):
+            out[rows[1 + larger[0] :]] = True
+    return out
+
+
 def world_balls(bodies: Bodies, group: Ints, world_count: int, bounded: Bools) -> Floats:
     """The ball of details of each world, and last of what all worlds share: x, y, z, radius; [worlds + 1, 4].
 

@@ -39,7 +39,7 @@ from warp_ir.device_scene import (
 from warp_ir.sampling import sobol
 from warp_ir.scene import Bools, Floats, InputError, Instances, Ints, Light, Material, Mesh, Scene
 from warp_ir.simulation import placement
-from warp_ir.simulation.bodies import areas, bodies_of, quaternions, rotations_and_stretches, world_balls
+from warp_ir.simulation.bodies import areas, backgrounds, bodies_of, quaternions, rotations_and_stretches, world_balls
 from warp_ir.simulation.placement import MovingPoints, PlacedBoxes, Placements, Prototypes, WorldFrames, WorldTargets
 from warp_ir.simulation.top_tree import new_top_tree, refit_top_tree
 from warp_ir.simulation.world_emitters import new_world_emitters
@@ -82,8 +82,8 @@ class LiveScene:
             world_count: Number of worlds.
             ids: What an image of shape indices shows of each instance, uint32 [n]; None: its row.
             deforming: Names of meshes whose points will change: their normals are those of their triangles.
-            unbounded: Rows of instances that are much larger than what happens around them, as grounds are: frame,
-                area and the aim of photons do not depend on them.
+            unbounded: Rows of instances without an end, as infinite planes are. Frame, area and the aim of photons do
+                not depend on them, nor on those that are eight times as large as the others of their world together.
             extent: Radius around what a world's instances show at first that matters most: half of the photons of
                 distant lights and skies is aimed there [scene units]; None: that of the world's instances.
             frame: The frame of the device; None: that of all bounded instances.
@@ -110,7 +110,8 @@ class LiveScene:
         self._group = np.where(group < 0, world_count, group)
         self._unbounded: Bools = np.zeros(count, bool)
         self._unbounded[list(unbounded)] = True
-        balls = world_balls(bodies, self._group, world_count, ~self._unbounded)
+        self._background = self._unbounded | backgrounds(bodies, self._group, world_count + 1)
+        balls = world_balls(bodies, self._group, world_count, ~self._background)
         self.frame = frame or _frame_of(balls)
         """The frame of the device."""
         self._radii = (balls[:, 3] if extent is None else np.full(world_count + 1, extent)) * self.frame.scale
@@ -430,8 +431,8 @@ class LiveScene:
         reach = np.append(_REACH * self._radii[:-1], 3.0e38)
         frames.reach = array(reach, wp.float32)
         area = areas(bodies) * self.frame.scale**2
-        bounded = np.bincount(self._group, np.where(self._unbounded, 0.0, area), self.world_count + 1)
-        grounds = np.bincount(self._group, self._unbounded, self.world_count + 1)
+        bounded = np.bincount(self._group, np.where(self._background, 0.0, area), self.world_count + 1)
+        grounds = np.bincount(self._group, self._background, self.world_count + 1)
         totals = bounded[:-1] + bounded[-1] + np.pi * self._radii[:-1] ** 2 * np.minimum(grounds[:-1] + grounds[-1], 1)
         self.areas = array(np.maximum(totals, 1.0e-30), wp.float32)
         """Area of the surfaces of each world; of unbounded ones only what is near."""
