@@ -293,6 +293,11 @@ class SensorCamera:
         for scene in self._scenes.values():
             scene.set_surfaces(state, deformable_visuals or self._visuals)
 
+    def follow(self, state: Any, *, render_config: Any = None) -> None:
+        """Takes poses, points and colours from a state, and refits: what `update` does before it renders."""
+        self.sync_deformable_meshes(state)
+        self._scene(self.default_render_config if render_config is None else render_config).follow(state)
+
     def update(
         self,
         state: Any,

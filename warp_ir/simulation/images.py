@@ -136,16 +136,30 @@ def _mean_channels(sums: ViewSums, pixel: int) -> wp.vec2:
 
 
 @wp.func
-def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int) -> wp.vec2:
-    """Variances of the mean channel around a pixel among those that show the same surface: direct, and indirect."""
+def _variance_of_mean(sums: ViewSums, pixel: int, n: float) -> wp.vec2:
+    """Variances of the means of n iterations of a pixel, from their spread."""
+    mean = _mean_channels(sums, pixel) / n
+    return wp.max(sums.squares[pixel] / n - wp.cw_mul(mean, mean), wp.vec2(0.0)) / (n - 1.0)
+
+
+@wp.func
+def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int, n: float) -> wp.vec2:
+    """Variances of the mean channels of n iterations, direct and indirect, of pixels around that show the same surface.
+
+    The spread of the iterations tells it; of a single iteration the spread of the neighbours, in which differences that
+    are real count as noise.
+    """
     row = p // surfaces.columns
     column = p - row * surfaces.columns
     begin = (row // rows) * rows
     surface = _surface_of(surfaces, p)
     own = _mean_channels(sums, p)  # the others are relative to it, so that little cancels
+    spread = n > 1.5
     weight = wp.vec2(1.0)
     mean = wp.vec2(0.0)
     square = wp.vec2(0.0)
+    if spread:
+        square = _variance_of_mean(sums, p, n)
     for dy in range(-2, 3):
         y = row + dy
         if y >= begin and y < begin + rows:
@@ -155,10 +169,13 @@ def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int)
                 if x >= 0 and x < surfaces.columns and (dx + dy) % 2 == 0 and not (dx == 0 and dy == 0):
                     q = y * surfaces.columns + x
                     w = _match(surfaces, surface, q)
-                    difference = _mean_channels(sums, q) - own
                     weight += w
-                    mean += wp.cw_mul(w, difference)
-                    square += wp.cw_mul(w, wp.cw_mul(difference, difference))
+                    if spread:
+                        square += wp.cw_mul(w, _variance_of_mean(sums, q, n))
+                    else:
+                        difference = _mean_channels(sums, q) - own
+                        mean += wp.cw_mul(w, difference)
+                        square += wp.cw_mul(w, wp.cw_mul(difference, difference))
     mean = wp.cw_div(mean, weight)
     return wp.max(wp.cw_div(square, weight) - wp.cw_mul(mean, mean), wp.vec2(0.0))
 
@@ -175,10 +192,10 @@ def _begin_filter(
     hits = sums.albedo[pixel][3]
     if views.world[view] < 0 or hits <= 0.0 or surfaces.footprint[pixel] <= 0.0:
         return
-    scale = float(views.samples) / (float(sums.count[view] + iterations) * hits)
-    direct = sums.direct[pixel] * scale
-    indirect = sums.indirect[pixel] * scale
-    variance = _local_variances(surfaces, sums, views.rows, pixel) * (scale * scale)
+    n = float(sums.count[view] + iterations) * hits / float(views.samples)
+    direct = sums.direct[pixel] / n
+    indirect = sums.indirect[pixel] / n
+    variance = _local_variances(surfaces, sums, views.rows, pixel, n)
     layer.direct[pixel] = wp.vec4(direct[0], direct[1], direct[2], variance[0])
     layer.indirect[pixel] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1])
 

@@ -109,6 +109,7 @@ class ViewSums:
     square: wp.array[wp.float32]  # of the mean channel of the radiance; empty: no error is wanted
     direct: wp.array[wp.vec3]  # irradiance over π; empty: nothing is filtered
     indirect: wp.array[wp.vec3]
+    squares: wp.array[wp.vec2]  # of the mean channels of both
 
 
 @wp.struct
@@ -500,11 +501,15 @@ def _add_light(
             square += sums.square[pixel]
         sums.square[pixel] = square
     if sums.direct.shape[0] > 0:
+        means = wp.vec2(direct[0] + direct[1] + direct[2], indirect[0] + indirect[1] + indirect[2]) / 3.0
+        squares = wp.cw_mul(means, means)
         if not is_first:
             new_direct += sums.direct[pixel]
             new_indirect += sums.indirect[pixel]
+            squares += sums.squares[pixel]
         sums.direct[pixel] = new_direct
         sums.indirect[pixel] = new_indirect
+        sums.squares[pixel] = squares
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)

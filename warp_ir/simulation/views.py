@@ -340,6 +340,7 @@ class Views:
         sums.square = optional("sums.square", error, wp.float32)
         sums.direct = optional("sums.direct", filtered, wp.vec3)
         sums.indirect = optional("sums.indirect", filtered, wp.vec3)
+        sums.squares = optional("sums.squares", filtered, wp.vec2)
         if scratch.allocations != allocations:
             sums.count.zero_()  # sums that are new have to begin with the first iteration
         return sums
