@@ -10,7 +10,7 @@ wp.init()
 
 _LAUNCHING = {
     *("Launcher", "LiveView", "Renderer", "device", "exec", "launcher", "main", "render", "trace_vpls", "upload_scene"),
-    "view_of",
+    *("LiveScene", "SensorCamera", "Views", "boxes", "pair", "view_of"),
 }
 """Fixtures and names by which most tests that launch kernels can be told; all of tests/physics do."""
 

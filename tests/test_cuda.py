@@ -2,7 +2,7 @@
 
 import ast
 import ctypes
-import importlib
+import importlib.util
 import struct
 from collections import Counter
 from contextlib import contextmanager
@@ -39,6 +39,7 @@ KERNEL_FILES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))
     for path in sorted(PACKAGE.rglob("*.py"))
     if "@wp.kernel" in path.read_text()
+    and (path.parent.name != "newton" or importlib.util.find_spec("newton") is not None)
 ]
 
 

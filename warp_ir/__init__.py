@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from warp_ir.scene import Texture as Texture
     from warp_ir.scene import Wrap as Wrap
     from warp_ir.settings import RenderSettings as RenderSettings
+    from warp_ir.simulation import ClearValues as ClearValues
+    from warp_ir.simulation import LiveScene as LiveScene
+    from warp_ir.simulation import Views as Views
+    from warp_ir.simulation import ViewSettings as ViewSettings
     from warp_ir.usd import StageReader as StageReader
     from warp_ir.usd import load_usd as load_usd
     from warp_ir.vpl.trace import trace_vpls as trace_vpls
@@ -56,6 +60,10 @@ _HOME = {
     "Film": "film",
     "Renderer": "renderer",
     "render": "renderer",
+    "ClearValues": "simulation",
+    "LiveScene": "simulation",
+    "ViewSettings": "simulation",
+    "Views": "simulation",
     "trace_vpls": "vpl.trace",
     "write_image": "image",
     "read_image": "image",

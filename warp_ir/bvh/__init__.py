@@ -11,10 +11,11 @@ BVH, where they are traced in the prototype's space.
 from warp_ir.bvh.build import build_instance_tree
 from warp_ir.bvh.forest import BvhForest
 from warp_ir.bvh.intersect8 import on_cuda
-from warp_ir.bvh.node_layout import Bvh, Instance, InstanceTree, RayHit, TwoLevel, empty_rows
+from warp_ir.bvh.node_layout import NO_TREE, Bvh, Instance, InstanceTree, RayHit, TwoLevel, empty_rows, vec8, vec8i
 from warp_ir.bvh.traverse import intersect, intersect_instances
 
 __all__ = [
+    "NO_TREE",
     "Bvh",
     "BvhForest",
     "Instance",
@@ -26,4 +27,6 @@ __all__ = [
     "intersect",
     "intersect_instances",
     "on_cuda",
+    "vec8",
+    "vec8i",
 ]

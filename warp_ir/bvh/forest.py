@@ -125,9 +125,9 @@ class BvhForest:
             row_offset = first_triangle - tree.triangle_offset
             refit_tree(self._bvh, tree.nodes, tree.blocks, points, indices, row_offset, self._launcher)
 
-    def root_node(self, number: int) -> int:
-        """The node of the wide tables at which a tree begins; -1 on CUDA."""
-        return -1 if self._trees[number].mesh is not None else self._trees[number].nodes.start
+    def ranges(self, number: int) -> tuple[range, range]:
+        """Nodes, the root first, and blocks of a wide tree; empty on CUDA."""
+        return self._trees[number].nodes, self._trees[number].blocks
 
     def root(self, number: int) -> int:
         """The value of `Instance.root` for a prototype with this tree."""

@@ -157,8 +157,21 @@ class Launcher:
                 if self._phase is not None:
                     self.profile.add(self._phase, -seconds)
 
-    def launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
+    def packed(self, kernel: Any, count: int, inputs: Sequence[Any]) -> Any:
+        """Warp's record of the launch of ``kernel(first, *inputs)`` for indices 0 to `count` - 1, to be repeated."""
+        self._wait_for(kernel.module)
+        self._modules.load(kernel.module)
+        values = [0, *inputs]
+        return wp.launch(kernel, dim=count, inputs=values, device=self.device, block_dim=_BLOCK_DIM, record_cmd=True)
+
+    def launch(self, kernel: Any, count: int, inputs: Sequence[Any], commands: list[Any] | None = None) -> None:
         """Runs ``kernel(first, *inputs)`` for indices 0 to `count` - 1.
+
+        Args:
+            kernel: The kernel.
+            count: Number of indices.
+            inputs: Arguments after `first`.
+            commands: A list that keeps recorded launches of bands between calls with the same arguments.
 
         Raises:
             Cancelled: `cancel` was called before all of it had run.
@@ -174,7 +187,10 @@ class Launcher:
             wp.launch(defined(kernel), dim=count, inputs=inputs, device=self.device, block_dim=_BLOCK_DIM)
             return
         launch = _Launch(kernel, count, inputs, self._overlap_phase, self._uninterruptible)
-        launch.commands.append(self._record_command(launch))  # in this thread, which loads the module if necessary
+        if commands is not None:
+            launch.commands = commands
+        if not launch.commands:
+            launch.commands.append(self._record_command(launch))  # in this thread, which loads the module if necessary
         per_index = self._seconds_per_index.get(kernel)
         even = count // (_MIN_BANDS * self.threads)
         launch.min_band = max(

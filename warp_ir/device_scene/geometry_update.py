@@ -117,9 +117,9 @@ class DeviceGeometry:
         """`Instance.root` of each `Instances` of a shutter sample."""
         return [self._forest.root(batch.tree) for batch in self.prototypes(sample)]
 
-    def root_nodes(self, sample: int) -> list[int]:
-        """The node at which the tree of each `Instances` of a shutter sample begins; -1 on CUDA."""
-        return [self._forest.root_node(batch.tree) for batch in self.prototypes(sample)]
+    def tree_ranges(self, batch: MeshBatch) -> tuple[range, range]:
+        """Nodes, the root first, and blocks of a batch's wide tree."""
+        return self._forest.ranges(batch.tree)
 
     def refit_boxes(self, batch: MeshBatch) -> None:
         """Refits the tree of a batch whose points have changed on the device."""

@@ -67,6 +67,7 @@ class SceneData:
     emission_texture: wp.array[wp.int32]  # as albedo_texture
     opacity_texture: wp.array[wp.int32]  # as albedo_texture
     texture_count: int
+    tinted: int  # 1: the colour of an instance multiplies the texture of a triangle that has `INSTANCE_COLOR`
     normal_map_count: int  # materials with a normal map
     surface_textures: wp.array[SurfaceTextures]  # one row: calls pass a pointer instead of copying the record
     non_opaque_count: int  # materials whose opacity is below 1 anywhere

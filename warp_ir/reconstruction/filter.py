@@ -15,10 +15,10 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 LEVELS = 4
 """Levels of the wavelet transform; taps are 1, 2, 4, ... pixels apart. At a fifth hardly any taps would be similar."""
-_SIGMAS = (5.5, 12.0)
+SIGMAS = (5.5, 12.0)
 """Standard errors by which similar values may differ at the first level, for direct and indirect irradiance. It is
 smaller for direct light, because its shadows are sharp."""
-_SIGMA_DECAY = 0.45
+SIGMA_DECAY = 0.45
 """Factor of the sigmas from level to level: filtered values are smooth, and differences over a distance are real."""
 
 
@@ -49,13 +49,13 @@ def rgb(row: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-def _tap_weight(k: int) -> float:
+def tap_weight(k: int) -> float:
     """The three middle taps, -1 to 1, of the B3 spline, over their sum; the outer two cost more than they remove."""
     return wp.where(k == 0, 3.0 / 7.0, 2.0 / 7.0)
 
 
 @wp.func
-def _similarity(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
+def similarity(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
     """Weight in [0, 1] of two values, by their difference in units of their noise; the same for (b, a).
 
     Noise is the mean of both variances. By that of `a` alone the picture would darken: what is dim by chance has little
@@ -67,7 +67,7 @@ def _similarity(a: wp.vec4, b: wp.vec4, sigma: float) -> float:
 
 
 @wp.func
-def _weighted(row: wp.vec4, weight: float) -> wp.vec4:
+def weighted(row: wp.vec4, weight: float) -> wp.vec4:
     """A row times a weight, and its variance times the square."""
     return wp.vec4(row[0] * weight, row[1] * weight, row[2] * weight, row[3] * weight * weight)
 
@@ -99,25 +99,25 @@ def _filter_level(
                     d = source.direct[q]
                     if d[3] >= 0.0:
                         i = source.indirect[q]
-                        w = _tap_weight(dx) * _tap_weight(dy)
+                        w = tap_weight(dx) * tap_weight(dy)
                         if q != p:
                             match = w * pixel_match_weights(surfaces, p, q)
                             if has_value:
-                                match[0] *= _similarity(own_direct, d, sigmas[0])
-                                match[1] *= _similarity(own_indirect, i, sigmas[1])
-                            direct += _weighted(d, match[0])
-                            indirect += _weighted(i, match[1])
+                                match[0] *= similarity(own_direct, d, sigmas[0])
+                                match[1] *= similarity(own_indirect, i, sigmas[1])
+                            direct += weighted(d, match[0])
+                            indirect += weighted(i, match[1])
                             weights += match
     if has_value:
-        direct += _weighted(own_direct, 1.0 - weights[0])
-        indirect += _weighted(own_indirect, 1.0 - weights[1])
+        direct += weighted(own_direct, 1.0 - weights[0])
+        indirect += weighted(own_indirect, 1.0 - weights[1])
         weights = wp.vec2(1.0)
-    out.direct[p] = _normalized(direct, weights[0])
-    out.indirect[p] = _normalized(indirect, weights[1])
+    out.direct[p] = normalized(direct, weights[0])
+    out.indirect[p] = normalized(indirect, weights[1])
 
 
 @wp.func
-def _normalized(sum: wp.vec4, weight: float) -> wp.vec4:
+def normalized(sum: wp.vec4, weight: float) -> wp.vec4:
     """Weighted mean and its variance, from a sum whose variance has squared weights; -1 without weight."""
     if weight < 1.0e-6:
         return wp.vec4(0.0, 0.0, 0.0, -1.0)
@@ -138,7 +138,7 @@ def filter_layer(
     """Filters a layer, and returns the result and a free layer; both arguments are overwritten."""
     pixels = surfaces.columns * surfaces.rows
     for level in range(LEVELS):
-        sigmas = wp.vec2(*(sigma * _SIGMA_DECAY**level for sigma in _SIGMAS))
+        sigmas = wp.vec2(*(sigma * SIGMA_DECAY**level for sigma in SIGMAS))
         launcher.launch(_filter_level, pixels, [surfaces, layer, scratch, 1 << level, sigmas])
         layer, scratch = scratch, layer
     return layer, scratch

@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MIN_MATCH = wp.constant(0.2)
 """Least `match_weight` of a point that counts as lying on the surface of a pixel."""
-_PLANE_DISTANCE = wp.constant(4.0)  # footprints off the tangent plane at which a point lies on another surface
+PLANE_DISTANCE = wp.constant(4.0)  # footprints off the tangent plane at which a point lies on another surface
 
 
 @wp.struct
@@ -56,7 +56,7 @@ def _match_weights(surfaces: PixelSurfaces, p: int, footprint: float, position: 
     facing *= facing
     difference = position - surfaces.position[p]
     distance = wp.max(wp.abs(wp.dot(pixel_normal, difference)), wp.abs(wp.dot(normal, difference)))
-    indirect = facing * _biweight(distance / (_PLANE_DISTANCE * footprint))
+    indirect = facing * _biweight(distance / (PLANE_DISTANCE * footprint))
     return wp.vec2(indirect * facing * facing * facing, indirect)
 
 

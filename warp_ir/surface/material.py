@@ -66,9 +66,12 @@ def albedo(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     material = scene.triangle_material[hit.triangle]
     if scene.texture_count > 0:
         if scene.albedo_texture[material] >= 0:
-            return _texture_at(
+            value = _texture_at(
                 scene.surface_textures, scene.albedo_texture[material], hit.triangle, hit.u, hit.v, hit.area, footprint
             )
+            if scene.tinted == 1 and scene.triangle_colors[hit.triangle] == _INSTANCE_COLOR:
+                value = wp.cw_mul(value, scene.instance_colors[hit.instance])
+            return value
     row = scene.triangle_colors[hit.triangle]
     if row == _INSTANCE_COLOR:
         return scene.instance_colors[hit.instance]
