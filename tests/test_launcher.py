@@ -110,7 +110,8 @@ def test_unknown_device_is_named():
 def test_compiling_is_reported(monkeypatch, caplog):
     """What the kernel cache lacks is reported when it begins, after each module, and in the end; the rest is silent."""
     monkeypatch.setattr(wp, "load_module", lambda *_, **__: None)
-    monkeypatch.setattr(ModuleLoader, "_is_cached", lambda self, module: module.startswith("cached"))
+    monkeypatch.setattr(ModuleLoader, "_load_cached", lambda self, module: module.startswith("cached"))
+    monkeypatch.setattr(ModuleLoader, "_path", lambda self, module: "no such file")
     loader = ModuleLoader(wp.get_device("cpu"), 64)
     with caplog.at_level(logging.INFO, "warp_ir"):
         loader.load("cached 1")
@@ -128,9 +129,10 @@ def test_kernel_cache_is_known(launcher):
     loader = ModuleLoader(launcher.device, 64)
     launcher.load([accumulate])
     module = wp.get_module(accumulate.__name__)
-    assert loader._is_cached(module)
+    assert loader._load_cached(module)
     other = SimpleNamespace(
         get_module_identifier=lambda block_dim: module.get_module_identifier(block_dim) + "0",
         _get_compile_output_name=module._get_compile_output_name,
+        _get_meta_name=module._get_meta_name,
     )
-    assert not loader._is_cached(other)
+    assert not loader._load_cached(other)

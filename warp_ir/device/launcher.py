@@ -8,6 +8,7 @@ result does not depend on the bands.
 Short launches, and work on the host, keep only one thread busy. `Launcher.overlap` gives the others something to do.
 """
 
+import logging
 import math
 import os
 import threading
@@ -19,10 +20,11 @@ from typing import Any, TypeVar
 
 import warp as wp
 
-from warp_ir.device.compiling import ModuleLoader
+from warp_ir.device.compiling import ModuleLoader, start_warp
 from warp_ir.device.profiling import Profile
 from warp_ir.scene import InputError
 
+_LOGGER = logging.getLogger("warp_ir")
 _MIN_BANDS = 16
 """Least number of bands of a launch, so that Ctrl-C need not wait for long."""
 _MAX_BANDS_PER_THREAD = 64
@@ -80,8 +82,10 @@ class Launcher:
             threads: CPU threads; by default one for each core this process may use.
 
         Raises:
-            InputError: There is no such device.
+            InputError: There is no such device, or no folder for compiled kernels.
         """
+        if warning := start_warp():
+            _LOGGER.warning("%s", warning)
         try:
             self.device = wp.get_device(device)
         except (ValueError, RuntimeError) as error:
