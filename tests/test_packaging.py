@@ -99,7 +99,7 @@ def test_license_is_complete():
 
 
 def test_entry_point_is_the_command():
-    """`warp-ir` is `warp_ir.cli.command`."""
-    from warp_ir.cli import command
+    """`warp-ir` and `python -m warp_ir` are the same."""
+    from warp_ir.__main__ import command
 
-    assert 'warp-ir = "warp_ir.cli:command"' in PROJECT.splitlines() and callable(command)
+    assert 'warp-ir = "warp_ir.__main__:command"' in PROJECT.splitlines() and callable(command)
