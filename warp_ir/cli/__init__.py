@@ -22,7 +22,7 @@ from typing import NoReturn
 
 from warp_ir.cli.arguments import parse
 from warp_ir.cli.console import LOGGER, Messages, discard_stdout, open_closed_streams, say
-from warp_ir.image.io import check_input
+from warp_ir.files import check_input
 from warp_ir.image.ocio import use_config
 from warp_ir.scene import InputError
 

@@ -389,7 +389,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     preview = "show the picture while it is rendered, in a window, or in a terminal that can"
     output.add_argument("--preview", action="store_true", help=preview)
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
-    resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
+    resume = "skip pictures that are there, and continue the one that an earlier command did not finish"
     output.add_argument("--resume", action="store_true", help=resume)
     checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)

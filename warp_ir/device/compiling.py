@@ -10,7 +10,6 @@ is found out before a module is compiled, because LLVM ends the process where it
 """
 
 import atexit
-import errno
 import hashlib
 import logging
 import os
@@ -24,6 +23,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_ir.files import check_room, reason
 from warp_ir.scene import InputError
 
 _LOGGER = logging.getLogger("warp_ir")
@@ -58,28 +58,14 @@ def _temporary_cache(cache: str, error: OSError) -> tuple[str, str]:
     Raises:
         InputError: There is no folder that can be written.
     """
-    why = f"the kernel cache {cache} cannot be written: {_reason(error)}"
+    why = f"the kernel cache {cache} cannot be written: {reason(error)}"
     for parent in (None, "/dev/shm"):
         with suppress(OSError):
             own = tempfile.mkdtemp(prefix="warp_ir_kernels_", dir=parent)
             atexit.register(shutil.rmtree, own, ignore_errors=True)
-            _check_room(own)
+            check_room(own, _MODULE_BYTES)
             return own, f"{why}; kernels are compiled for this run alone, unless WARP_CACHE_PATH names another folder"
     raise InputError(f"{why}; WARP_CACHE_PATH names another folder") from error
-
-
-def _check_room(folder: str) -> None:
-    """Raises `OSError` if a module cannot be written to a folder."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        try:
-            if hasattr(os, "posix_fallocate"):  # knows of quotas
-                os.posix_fallocate(file.fileno(), 0, _MODULE_BYTES)
-                return
-        except OSError as error:
-            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
-                raise
-    if shutil.disk_usage(folder).free < _MODULE_BYTES:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _checksum(path: str) -> str:
@@ -92,10 +78,6 @@ def _noted_checksum(path: str) -> str | None:
     with suppress(FileNotFoundError), open(path + _CHECKSUM, encoding="ascii", errors="replace") as file:
         return file.read()
     return None
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
 
 
 class ModuleLoader:
@@ -129,7 +111,7 @@ class ModuleLoader:
                 break
             except OSError as error:
                 if is_last:
-                    raise InputError(f"kernels cannot be compiled in {cache}: {_reason(error)}") from error
+                    raise InputError(f"kernels cannot be compiled in {cache}: {reason(error)}") from error
                 self._replace_cache(cache, error)
                 module.failed_builds.clear()
         with self._lock:
@@ -176,7 +158,7 @@ class ModuleLoader:
                 self._began = time.perf_counter()
                 self._say("compiling kernels, once: %d of %d modules done")
         os.makedirs(str(wp.config.kernel_cache_dir), exist_ok=True)
-        _check_room(str(wp.config.kernel_cache_dir))
+        check_room(str(wp.config.kernel_cache_dir), _MODULE_BYTES)
         self._load(module)
         path = self._path(module)
         with suppress(OSError):  # without a checksum the module is as good as those of other programs

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
-from warp_ir.image.io import check_input
+from warp_ir.files import check_input
 from warp_ir.scene import InputError
 from warp_ir.usd.stage.crate_validation import validate_crate
 from warp_ir.usd.stage.mtlx_layers import layers_with_mtlx
