@@ -122,7 +122,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         InputError: Writing failed.
     """
     # A link is followed: its target is replaced, and not the link.
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
     temporary = _temporary(target)
     try:
         yield temporary

@@ -6,6 +6,7 @@ The flags for `RenderSettings` are generated from its fields: a new field is a n
 import argparse
 import dataclasses
 import math
+import os
 import re
 import types
 import typing
@@ -170,6 +171,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Raises:
         InputError: The arguments or the settings file are wrong.
     """
+    for word in argv:
+        try:
+            word.encode("utf-8")
+        except UnicodeEncodeError:
+            raise InputError(f"{os.fsencode(word)!r}: is not UTF-8, as names of files and prims must be") from None
     parser, commands = _parsers()
     words = _join_aov_names(argv)
     args, unknown = parser.parse_known_args(words)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+from warp_ir.files import special_kind
 from warp_ir.scene import InputError
 
 if TYPE_CHECKING:
@@ -67,6 +68,8 @@ class Messages:
         if file is None:
             return
         try:
+            if special_kind(file) == "a pipe":  # to open it would wait for a reader
+                os.close(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
             log = _LogFile(file, encoding="utf-8", errors="backslashreplace")
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
