@@ -106,6 +106,8 @@ def _run(argv: Sequence[str], messages: Messages, started: float) -> int:
             discard_stdout()
         return _fail(1, f"error: {where}: {(error.strerror or str(error)).lower()}", trace=verbose)
     except Exception as error:
+        if "can't start new thread" in str(error):
+            return _fail(1, "error: the system refuses a thread: see ulimit -u and ulimit -v")
         hint = "" if verbose else " (--verbose shows where)"
         return _fail(1, f"internal error: {type(error).__name__}: {error}{hint}")
 
