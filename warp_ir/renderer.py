@@ -185,6 +185,7 @@ class Renderer:
         *,
         started: float | None = None,
         reserve: float = 0.0,
+        iterations: range | None = None,
     ) -> Film:
         """Adds iterations to a film until one of the settings' limits is reached; at least one.
 
@@ -197,18 +198,23 @@ class Renderer:
             progress: Called after every iteration.
             started: `time.perf_counter` from which the time counts, before uploading for example; None: this call.
             reserve: Time of the limit that the caller needs after this call, for writing the picture for example [s].
+            iterations: Those that the film is to hold in the end, to be merged with films of others; it may hold the
+                first of them. None: the first ones, up to the limits.
         """
         start = time.perf_counter() if started is None else started
         film = film or self.new_film()
         start -= film.seconds
         with cancel_on_signal(self.launcher, film):
             film.seconds = time.perf_counter() - start
-            scheduler = AdaptiveScheduler(film, self.settings, self._is_adaptive())
+            first, settings = 0, self.settings
+            if iterations is not None:
+                first, settings = iterations.start, replace(settings, iterations=len(iterations))
+            scheduler = AdaptiveScheduler(film, settings, self._is_adaptive())
             profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
-            while not film.interrupted and film.iterations < self.settings.iteration_limit:
+            while not film.interrupted and film.iterations < settings.iteration_limit:
                 try:
-                    self.add_iteration(film, film.iterations)
+                    self.add_iteration(film, first + film.iterations)
                     film.seconds = time.perf_counter() - start
                     spent, samples = profile.since(before), profile.counts["primary_rays"] - rays
                     picture = self._picture_seconds(film, spent["primary"] / samples, spent["film"] / samples)

@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from types import FrameType
@@ -57,6 +58,8 @@ def main(argv: Sequence[str] | None = None, started: float | None = None) -> int
     """
     started = time.perf_counter() if started is None else started
     argv = sys.argv[1:] if argv is None else list(argv)
+    # Warp says so on import; whoever runs the command cannot help it.
+    warnings.filterwarnings("ignore", "Support for Python 3.10 is deprecated", FutureWarning)
     open_closed_streams()
     # A file name that the terminal cannot encode must not raise an error.
     if hasattr(sys.stdout, "reconfigure"):
@@ -80,7 +83,8 @@ def _run(argv: Sequence[str], messages: Messages, started: float) -> int:
         messages.configure(quiet=args.quiet, verbose=args.verbose, file=args.log_file)
         verbose = args.verbose
         LOGGER.debug("%s", shlex.join(["warp-ir", *argv]))
-        check_input(args.stage, "a USD file")  # before anything is imported that takes time
+        if args.stage is not None:
+            check_input(args.stage, "a USD file")  # before anything is imported that takes time
         args.started = started
         with use_config(args.ocio_config):
             code: int = importlib.import_module(f"warp_ir.cli.{args.command}").run(args)

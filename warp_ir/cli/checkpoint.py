@@ -32,7 +32,7 @@ _UNHASHED_SCENE_FIELDS = ("warnings", "stats", "name", "settings")
 class Checkpoint:
     """The checkpoint of one picture, `picture.exr.film.npz`; it is removed when the picture is finished."""
 
-    def __init__(self, output: Path, film: "Film", key: Callable[[], str], interval: float) -> None:
+    def __init__(self, output: Path, film: "Film", key: Callable[[], str], interval: float, note: str = "") -> None:
         """Prepares a checkpoint; no file is read or written.
 
         Args:
@@ -40,9 +40,10 @@ class Checkpoint:
             film: Film of the picture.
             key: Computes the `fingerprint` of the scene and the settings; called on first use, and once only.
             interval: Seconds between checkpoints; 0: none are written.
+            note: A text that is stored with the film.
         """
         self.path = checkpoint_path(output)
-        self._film, self._key, self._interval = film, cache(key), interval
+        self._film, self._key, self._interval, self._note = film, cache(key), interval, note
         self._due = time.monotonic() + interval
         self._failed = False  # the last write
 
@@ -100,7 +101,7 @@ class Checkpoint:
 
     def _save(self, path: Path) -> None:
         with whole_file(path) as temporary:
-            self._film.save(temporary, self._key())
+            self._film.save(temporary, self._key(), self._note)
 
     def remove(self) -> None:
         """Deletes the checkpoint of a finished picture."""

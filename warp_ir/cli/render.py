@@ -21,6 +21,7 @@ from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_war
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
+from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_part
 from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
 from warp_ir.files import check_output, whole_file
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
@@ -67,6 +68,8 @@ class _Job:
     reader: "StageReader"
     view: tuple[str, str] | None
     """OpenColorIO's display and view; None: pictures are tone-mapped."""
+    films: Sequence[PartFilm] = ()
+    """The parts that the picture is made of; none: it is rendered."""
     preview: "FilmPreview | None" = None
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
@@ -76,10 +79,13 @@ class _Job:
     """Warnings that have been printed."""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Renders the stage's picture, or one for each frame and product; returns the exit code."""
+def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
+    """Renders the stage's picture, or one for each frame and product; returns the exit code.
+
+    With `films` the picture is made of these parts.
+    """
     # All errors of the command line are reported before anything is loaded.
-    settings_of(args)
+    part_of(args, settings_of(args))
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     _check_exr_flags(args, into_folder)
@@ -104,8 +110,10 @@ def run(args: argparse.Namespace) -> int:
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader, view, preview)
-    if into_folder:
+    job = _Job(args, device, versions, reader, view, films, preview)
+    if films:
+        pictures = [_merged_picture(job)]
+    elif into_folder:
         pictures = _products(job)
 
     frames: list[dict[str, Any]] = []
@@ -205,6 +213,22 @@ def _products(job: _Job) -> list[_Picture]:
     return pictures
 
 
+def _merged_picture(job: _Job) -> _Picture:
+    """The picture that films are parts of.
+
+    Raises:
+        InputError: The output is a folder, or the stage no longer has their RenderProduct.
+    """
+    path, first, code = Path(job.args.output), job.films[0], time_code_of(job.args)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the file to write")
+    products = {product.path: product for product in job.reader.spec(code).products}
+    if first.product is not None and first.product not in products:
+        raise InputError(f"{first.path}: its RenderProduct {first.product} is no longer there")
+    product = None if first.product is None else products[first.product]
+    return _Picture(code, product, {path: None if product is None else product.aovs})
+
+
 def _render_picture(job: _Job, picture: _Picture, label: str, started: float) -> tuple[dict[str, Any], int] | None:
     """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code.
 
@@ -227,15 +251,26 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         job.warned.update(scene.warnings)
         settings = settings_of(args, scene.settings)
         key = _picture_key(job, picture, scene, settings)
-        if args.resume and not checkpoint_path(path).exists() and _is_finished(job, picture, scene, settings, key):
+        part = part_of(args, settings)
+        if (
+            args.resume
+            and part is None
+            and not checkpoint_path(path).exists()
+            and _is_finished(job, picture, scene, settings, key)
+        ):
             return None
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
         else:
             job.renderer = ir.Renderer(scene, settings, device=job.device, threads=job.args.threads)
         renderer, film = job.renderer, job.renderer.new_film()
-        checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint)
+        product = None if picture.product is None else picture.product.path
+        note = "" if part is None else note_of(part, args, picture.time, product)
+        checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint, note)
+        _check_part(part, checkpoint.path, resume=args.resume)
         if args.resume and checkpoint.resume():
+            if part is not None and film.iterations >= len(part.iterations):
+                return None
             say(f"{path}: continues after {film.iterations} iterations")
 
         def report(progress: "Progress") -> None:
@@ -249,9 +284,13 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         exr = _exr_options(job, picture)  # before the render, so that its camera rays are within the time limit
         reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
         try:
-            renderer.render(film, report, started=started, reserve=reserve)
+            if job.films:
+                _merge(job.films, film, renderer, fingerprint(scene, renderer.settings))
+            else:
+                iterations = None if part is None else part.iterations
+                renderer.render(film, report, started=started, reserve=reserve, iterations=iterations)
         except MemoryError as error:
-            _keep(checkpoint, f"out of memory: {error}")
+            _say_saved(checkpoint.keep(), checkpoint, f"out of memory: {error}")
             raise
         render_seconds = time.perf_counter() - begin
         if preview is not None:
@@ -263,7 +302,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     written: list[Path] = []
     write_warnings: list[str] = []
     failure = ""
-    if film.iterations or not stop_signal:
+    if part is None and (film.iterations or not stop_signal):
         begin = time.perf_counter()
         metadata: dict[str, object] = {
             **job.versions,
@@ -294,8 +333,15 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
         job.write_seconds = timings["write"]
-    if failure:
-        _keep(checkpoint, failure)
+    if part is not None and not stop_signal:
+        saved = checkpoint.keep()
+        if saved != checkpoint.path:
+            _say_saved(saved, checkpoint, f"{checkpoint.path}: cannot be written")
+            code = 1
+        else:
+            written = [saved]
+    elif failure:
+        _say_saved(checkpoint.keep(), checkpoint, failure)
     elif not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
@@ -308,7 +354,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
         picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
     say_warnings(picture_warnings)
-    _summarize(job, path, film, written=bool(written), blank=bool(blank))
+    _summarize(
+        job, written[0] if part is not None and written else path, film, written=bool(written), blank=bool(blank)
+    )
     statistics = {
         "output": [str(file) for file in written],
         "frame": picture.time,
@@ -408,15 +456,37 @@ def _is_finished(job: _Job, picture: _Picture, scene: Scene, settings: RenderSet
     return True
 
 
-def _keep(checkpoint: Checkpoint, failure: str) -> None:
-    """Says that the picture could not be written, and where its film is kept."""
-    kept = checkpoint.keep()
-    if kept is None:
+def _check_part(part: Part | None, film: Path, *, resume: bool) -> None:
+    """Raises `InputError` if the film that is there is of another part: one must not take the other's place."""
+    if not film.exists() or (part is None and not resume):
+        return
+    from warp_ir.film import read_state
+
+    other = read_part(film).part if read_state(film).note else None
+    if other != part:
+        holds = "a whole picture" if other is None else f"{other} of {other.total} iterations"
+        raise InputError(f"{film}: holds {holds}: name another OUTPUT, or remove it")
+
+
+def _merge(films: Sequence[PartFilm], film: "Film", renderer: "Renderer", key: str) -> None:
+    """Makes an empty film the whole of its parts, which are merged in their order: always to the same bits."""
+    film.resume(films[0].path, key)
+    for part in films[1:]:
+        other = renderer.new_film()
+        other.resume(part.path, key)
+        film.merge(other)
+
+
+def _say_saved(saved: Path | None, checkpoint: Checkpoint, failure: str) -> None:
+    """Says that the picture could not be written, and where its film lies."""
+    if saved is None:
         say(f"error: {failure}; there is no room for its film either", logging.ERROR)
-    elif kept == checkpoint.path:
-        say(f"error: {failure}; its film is kept in {kept}, from which --resume continues", logging.ERROR)
+    elif saved == checkpoint.path:
+        say(f"error: {failure}; its film is kept in {saved}, from which --resume continues", logging.ERROR)
     else:
-        say(f"error: {failure}; its film is kept in {kept}: as {checkpoint.path}, --resume continues it", logging.ERROR)
+        say(
+            f"error: {failure}; its film is kept in {saved}: as {checkpoint.path}, --resume continues it", logging.ERROR
+        )
 
 
 def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: bool) -> None:

@@ -162,9 +162,9 @@ class ModuleLoader:
         self._load(module)
         path = self._path(module)
         with suppress(OSError):  # without a checksum the module is as good as those of other programs
-            temporary = f"{path}.{os.getpid()}"
+            checksum, temporary = _checksum(path), f"{path}.{os.getpid()}"
             with open(temporary, "w", encoding="ascii") as file:
-                file.write(_checksum(path))
+                file.write(checksum)
             os.replace(temporary, path + _CHECKSUM)
 
     def _load(self, module: Any) -> None:

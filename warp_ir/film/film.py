@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ from warp_ir.image.io import write_image
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import TILE, Tiles, all_tiles, some_tiles, tile_count
+
+if TYPE_CHECKING:
+    from typing import Self  # Python 3.11
 
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 """Names that `Film.aov` accepts."""
@@ -69,7 +72,7 @@ class PictureFilter(Protocol):
     def arrays(self) -> dict[str, "wp.array[Any]"]:
         """The sums over the samples by name; they are saved with the film."""
 
-    def merge(self, other: Self) -> None:
+    def merge(self, other: "Self") -> None:
         """Adds the samples of another film's filter."""
 
     def cost(self, iterations: int) -> tuple[float, float]:
@@ -507,14 +510,15 @@ class Film:
         return f'<img src="data:image/png;base64,{data}" alt="{caption}"><br>{caption}'
 
     @_exclusive
-    def save(self, path: str | os.PathLike[str], key: str = "") -> None:
+    def save(self, path: str | os.PathLike[str], key: str = "", note: str = "") -> None:
         """Writes the film and the samples of its filter as .npz; `load` and `resume` restore it bit for bit.
 
         Args:
             path: The file.
             key: Identifies the scene and the settings; `resume` compares it.
+            note: A text of the caller's, which is stored with it.
         """
-        state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame)
+        state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame, note)
         write_film(path, state, self._saved_arrays(), self._noise)
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:

@@ -65,6 +65,8 @@ class FilmState:
     """[tiles], the tiles of the next iteration."""
     frame: DeviceFrame
     """The device frame in which positions and depths are stored."""
+    note: str = ""
+    """What the program that wrote it says of it."""
 
 
 def write_film(
@@ -76,6 +78,8 @@ def write_film(
     """Writes the state of a film, its arrays by name, and what is known of its picture's noise."""
     values: dict[str, Any] = {name: array.numpy() for name, array in arrays.items()}
     values["key"] = state.key
+    if state.note:
+        values["note"] = state.note
     values["size"] = np.array([state.width, state.height, state.iterations], np.int64)
     values["seconds"], values["chosen"] = float(state.seconds), state.chosen
     values["origin"], values["scale"] = np.asarray(state.frame.origin, np.float64), float(state.frame.scale)
@@ -178,6 +182,7 @@ class FilmFile:
             seconds=float(values["seconds"]),
             chosen=chosen,
             frame=DeviceFrame(values["origin"], float(values["scale"])),
+            note=self.text("note") if "note" in self else "",
         )
 
     def text(self, name: str) -> str:
@@ -241,6 +246,16 @@ def open_film(path: str | os.PathLike[str]) -> Iterator[FilmFile]:
     except Exception as error:  # zipfile and NumPy raise a dozen kinds for what a file may hold
         what = first_line(str(error)) or type(error).__name__
         raise InputError(f"{os.fspath(path)}: not a film: {what}") from error
+
+
+def read_state(path: str | os.PathLike[str]) -> FilmState:
+    """The state of a film in a file.
+
+    Raises:
+        InputError: The file is missing, or is no film.
+    """
+    with open_film(path) as file:
+        return file.state
 
 
 def layout_of(dtype: Any, rows: int) -> Layout:
