@@ -17,6 +17,7 @@ PACKAGE = Path(ir.__file__).parent
 # Lowest first: a module may import from its own layer's left and from the layers before it.
 LAYERS = [
     ["scene"],
+    ["files"],
     ["image", "metrics"],
     ["settings"],
     ["memory"],

@@ -43,7 +43,7 @@ def test_save_and_load(tmp_path, device):
     np.testing.assert_array_equal(back.aov("position"), film.aov("position"))
     back.merge(film)
     assert back.iterations == 12
-    with pytest.raises(ir.InputError, match="not a film"):
+    with pytest.raises(ir.InputError, match="no such file"):
         ir.Film.load(tmp_path / "missing.npz")
 
 

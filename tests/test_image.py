@@ -13,9 +13,10 @@ import pytest
 from pxr import Gf
 
 from warp_ir import Camera, InputError, Projection, RenderSettings, Scene
+from warp_ir.files import check_output, whole_file
 from warp_ir.image.color_space import COLOR_SPACES, REC709, matrix
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions, frame_rate
-from warp_ir.image.io import AOV_CHANNELS, check_output, read_image, whole_file, write_image
+from warp_ir.image.io import AOV_CHANNELS, SUFFIXES, read_image, write_image
 from warp_ir.image.tonemap import srgb_from_linear
 from warp_ir.procedural import cornell_box
 
@@ -209,7 +210,7 @@ def test_bad_paths_are_one_line(tmp_path, name, message):
     """Before anything is rendered, one line says what is wrong with the output."""
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=message) as caught:
-        check_output(tmp_path / name)
+        check_output(tmp_path / name, SUFFIXES)
     assert "\n" not in str(caught.value)
     assert sorted(os.listdir(tmp_path)) == ["file"]
 
@@ -218,13 +219,13 @@ def test_devices_and_folders_are_not_replaced(tmp_path):
     """A rename would happily replace a device or a pipe by a picture."""
     os.mkfifo(tmp_path / "a.png")
     with pytest.raises(InputError, match="not a regular file"):
-        check_output(tmp_path / "a.png")
+        check_output(tmp_path / "a.png", SUFFIXES)
 
 
 def test_folder_is_made_on_request(tmp_path, film):
     """`make_folder` creates what is missing."""
     path = tmp_path / "x" / "y" / "a.png"
-    assert check_output(path, make_folder=True) == path
+    assert check_output(path, SUFFIXES, make_folder=True) == path
     write_image(path, film)
     assert os.listdir(path.parent) == ["a.png"]
 

@@ -113,7 +113,8 @@ def test_compiling_is_reported(monkeypatch, caplog):
     monkeypatch.setattr(wp, "load_module", lambda *_, **__: None)
     monkeypatch.setattr(definitions, "load", lambda module: module.startswith("recorded"))
     monkeypatch.setattr(definitions, "record", lambda *_: None)
-    monkeypatch.setattr(ModuleLoader, "_is_cached", lambda self, module: module.startswith("cached"))
+    monkeypatch.setattr(ModuleLoader, "_load_cached", lambda self, module: module.startswith("cached"))
+    monkeypatch.setattr(ModuleLoader, "_path", lambda self, module: "no such file")
     loader = ModuleLoader(wp.get_device("cpu"), 64)
     with caplog.at_level(logging.INFO, "warp_ir"):
         loader.load("cached 1")
@@ -133,9 +134,10 @@ def test_kernel_cache_is_known(launcher):
     definitions.define_all()
     launcher.load([accumulate])
     module = wp.get_module(accumulate.__name__)
-    assert loader._is_cached(module)
+    assert loader._load_cached(module)
     other = SimpleNamespace(
         get_module_identifier=lambda block_dim: module.get_module_identifier(block_dim) + "0",
         _get_compile_output_name=module._get_compile_output_name,
+        _get_meta_name=module._get_meta_name,
     )
-    assert not loader._is_cached(other)
+    assert not loader._load_cached(other)

@@ -2,15 +2,24 @@
 
 import gc
 import json
+import math
+import os
+import re
+import resource
+import subprocess
+import sys
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom
 
 import warp_ir as ir
 from tests.physics.closed_form import placed
 from tests.physics.scenes import DOWN, everything, lamp_profile
+from warp_ir import memory
 from warp_ir.cli import main
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene import upload_scenes
@@ -18,6 +27,8 @@ from warp_ir.memory import pixel_bytes, scene_bytes
 from warp_ir.procedural import cornell_box, furnace, mesh, sphere
 from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind, Shaping
+
+ROOM = Path(__file__).parent.parent / "scenes_usd" / "cornell_box.usda"
 
 
 class Counting(Launcher):
@@ -191,3 +202,118 @@ def test_info_reports_what_is_skipped_and_guessed(tmp_path, capsys):
     assert main(["info", str(file), "--json"]) == 0
     guessed = json.loads(capsys.readouterr().out)["guessed"]
     assert guessed["camera"] == "the first of 2" and "white dome" in guessed["light"]
+
+
+# ---- what there is ---------------------------------------------------------------------------------------
+
+
+def test_what_is_available_is_no_more_than_is_free(monkeypatch):
+    """It is what /proc/meminfo says, and less under `ulimit -v`, by what the process has mapped already."""
+    free = memory.available_memory()
+    assert 0 < free <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + (1 << 28), limits[1]))
+    try:
+        left = memory.available_memory()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert 0.8 * 2**28 < left <= 2**28
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_control_groups_limit_the_memory(tmp_path, monkeypatch, version):
+    """The least that a group or one around it leaves counts; copies of files are free; containers have own roots."""
+    root = tmp_path / "memory" if version == 1 else tmp_path
+    limit, usage = memory._CGROUP_FILES[version == 1]
+    inactive = "total_inactive_file" if version == 1 else "inactive_file"
+    groups = ("", "max", 0), ("farm", 5000, 3000), ("farm/job", 4000, 1500), ("farm/job/deep", "max", 7)
+    for path, bound, used in groups:
+        group = root / path
+        group.mkdir(parents=True, exist_ok=True)
+        (group / limit).write_text(str(2**63 - 4096 if bound == "max" and version == 1 else bound) + "\n")
+        (group / usage).write_text(f"{used}\n")
+        (group / "memory.stat").write_text(f"anon 1\n{inactive} 200\n")
+    own = tmp_path / "own"
+    monkeypatch.setattr(memory, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(memory, "_OWN_CGROUPS", own)
+    prefix = "4:cpu:/other\n3:memory:" if version == 1 else "0::"
+    inside = dict.fromkeys(("/farm/job/deep", "/farm/job", "/farm"), 2200)
+    for path, left in (inside | dict.fromkeys(("/", "/elsewhere"), math.inf)).items():
+        own.write_text(f"{prefix}{path}\n")
+        assert memory._left_by_cgroups() == left, path
+        if left < math.inf:
+            assert memory.available_memory() == left
+    (root / "farm" / "job" / limit).write_text("1000\n")  # less than is used
+    own.write_text(f"{prefix}/farm/job\n")
+    assert memory.available_memory() == 0.0
+    (root / limit).write_text("600\n")  # in a container
+    (root / usage).write_text("500\n")
+    own.write_text(f"{prefix}/of/the/machine\n")
+    assert memory.available_memory() == 300
+
+
+@pytest.mark.extended
+def test_a_real_control_group(tmp_path):
+    """A process in a group of 3 GB is told so; with 4096 x 4096 pixels it ends in one line with the numbers."""
+    group = Path("/sys/fs/cgroup/memory/warp_ir_test")
+    try:
+        group.mkdir()
+        (group / "memory.limit_in_bytes").write_text(str(3 * 2**30))
+    except OSError:
+        pytest.skip("no control groups of version 1, or not root")
+    enter = "import sys; from pathlib import Path; Path(sys.argv.pop(1)).write_text('0'); "
+    python = enter + "from warp_ir.cli import command; command()"
+    words = ["render", str(ROOM), str(tmp_path / "a.npy"), "--res", "4096", "4096", "--iterations", "1"]
+    try:
+        process = [sys.executable, "-c", python, str(group / "cgroup.procs"), *words]
+        done = subprocess.run(process, capture_output=True, text=True)
+    finally:
+        group.rmdir()
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert re.search(r"4096 x 4096 pixels need about 4\.. GiB, cpu has [12]\.. GiB", done.stderr)
+
+
+def test_what_is_too_large_is_refused_with_the_numbers(tmp_path, monkeypatch):
+    """Faces and instances, before they are expanded; what is small is not looked at."""
+    faces, instances = tmp_path / "faces.usda", tmp_path / "instances.usda"
+    stage = Usd.Stage.CreateNew(str(faces))
+    mesh = UsdGeom.Mesh.Define(stage, "/M")
+    count = 300_000
+    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    mesh.CreateFaceVertexCountsAttr([3] * count)
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2] * count)
+    stage.Save()
+    stage = Usd.Stage.CreateNew(str(instances))
+    UsdGeom.Cube.Define(stage, "/C")
+    instancer = UsdGeom.PointInstancer.Define(stage, "/P")
+    instancer.CreatePrototypesRel().AddTarget("/C")
+    instancer.CreatePositionsAttr([(0, 0, 0)])
+    instancer.CreateProtoIndicesAttr([0] * 200_000)
+    stage.Save()
+    monkeypatch.setattr(memory, "available_memory", lambda: 70_000_000.0)
+    with pytest.raises(ir.InputError, match=r"/M: 300000 faces need about 0\.1 GiB of memory, 0\.1 GiB are available"):
+        ir.load_usd(faces)
+    with pytest.raises(ir.InputError, match=r"/P: 200000 instances need about 0\.1 GiB of memory, 0\.1 GiB are"):
+        ir.load_usd(instances)
+    memory.require_memory(60_000_000, "what is small is not looked at: it would")
+
+
+LIMITED = ["render", str(ROOM), "a.npy", "--iterations", "1", "--light-paths", "64"]
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(
+    ("limit", "words", "said"),
+    [
+        (1_000_000, LIMITED, "ulimit -v: 1.0 GiB of address space are too few"),
+        (3_000_000, [*LIMITED, "--res", "4096", "4096"], "4096 x 4096 pixels need about 4"),
+    ],
+)
+def test_ulimit_is_one_line(tmp_path, limit, words, said):
+    """A process of limited address space refuses what does not fit, and does not start with less than it needs."""
+    command = ["sh", "-c", f'ulimit -v {limit}; exec "$@"', "sh", sys.executable, "-m", "warp_ir", *words]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=env)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and said in done.stderr, done.stderr
+    assert os.listdir(tmp_path) == []

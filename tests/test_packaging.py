@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -98,8 +99,23 @@ def test_license_is_complete():
     assert "END OF TERMS AND CONDITIONS" in text
 
 
-def test_entry_point_is_the_command():
-    """`warp-ir` is `warp_ir.cli.command`."""
-    from warp_ir.cli import command
+def test_the_archive_of_the_sources_has_what_its_tests_need():
+    """Every folder beside the package is in MANIFEST.in, but for that of GitHub, and so is every document."""
+    manifest = (ROOT / "MANIFEST.in").read_text(encoding="utf-8")
+    grafted = {line.split()[1] for line in manifest.splitlines() if line.startswith("graft")}
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if tracked.returncode or not tracked.stdout:
+        pytest.skip("not a checkout")
+    folders = {line.split("/")[0] for line in tracked.stdout.splitlines() if "/" in line}
+    assert folders - {"warp_ir", ".github"} == grafted
+    files = {line for line in tracked.stdout.splitlines() if "/" not in line}
+    (included,) = (line.split()[1:] for line in manifest.splitlines() if line.startswith("include"))
+    by_setuptools = {"LICENSE", "pyproject.toml", "MANIFEST.in"}
+    assert all(any(fnmatch(file, pattern) for pattern in included) for file in files - by_setuptools)
 
-    assert 'warp-ir = "warp_ir.cli:command"' in PROJECT.splitlines() and callable(command)
+
+def test_entry_point_is_the_command():
+    """`warp-ir` and `python -m warp_ir` are the same."""
+    from warp_ir.__main__ import command
+
+    assert 'warp-ir = "warp_ir.__main__:command"' in PROJECT.splitlines() and callable(command)

@@ -1,14 +1,22 @@
-"""Estimates of the memory that a pixel and a scene take where they are rendered, before anything is uploaded."""
+"""Memory: what a pixel and a scene take where they are rendered, before anything is uploaded, and what there is."""
 
 import math
+import os
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.scene import Instances, Light, Mesh, MeshLight, Scene
+from warp_ir.scene import InputError, Instances, Light, Mesh, MeshLight, Scene
 from warp_ir.settings import RenderSettings
 
+_CGROUPS, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_CGROUP_FILES = ("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")
+"""Limit and usage in versions 2 and 1."""
+_SMALL = 1 << 26
+"""What is asked for without a look at what there is [bytes]."""
 _FLOAT = _INT = 4
 _VEC2, _VEC3, _VEC4 = 8, 12, 16
 
@@ -75,6 +83,91 @@ def pixel_bytes(scene: Scene, settings: RenderSettings, *, guided: bool = True) 
         + host_picture
         + _DENOISER * settings.denoise
     )
+
+
+def available_memory() -> float:
+    """Bytes that this process may still allocate: the least that its limits, its control groups and the machine leave.
+
+    Memory that holds copies of files counts as free. Infinity if nothing is known.
+    """
+    found = [_left_by_limits(), _left_by_cgroups(), math.inf]
+    with suppress(OSError, ValueError, IndexError, AttributeError):
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return max(0.0, min(*found, 1024.0 * int(line.split()[1])))
+    with suppress(OSError, ValueError, AttributeError):  # not Linux
+        found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
+    return max(0.0, min(found))
+
+
+def require_memory(needed: float, what: str) -> None:
+    """Refuses what needs more memory than is available.
+
+    Args:
+        needed: Bytes, at its peak.
+        what: What needs it, in the plural.
+
+    Raises:
+        InputError: It is too much; the message has the numbers.
+    """
+    if needed > _SMALL and needed > (available := available_memory()):
+        raise InputError(f"{what} need about {gibibytes(needed)} of memory, {gibibytes(available)} are available")
+
+
+def gibibytes(size: float) -> str:
+    """A size [bytes] in words."""
+    return f"{size / 2**30:.{0 if size >= 10 * 2**30 else 1}f} GiB"
+
+
+def _left_by_limits() -> float:
+    """What `ulimit -v` and `ulimit -d` leave [bytes]."""
+    left = math.inf
+    with suppress(ImportError, OSError, ValueError, IndexError):  # not on every system
+        import resource
+
+        pages = [int(x) for x in Path("/proc/self/statm").read_text(encoding="ascii").split()]
+        for kind, used in ((resource.RLIMIT_AS, pages[0]), (resource.RLIMIT_DATA, pages[5])):
+            limit = resource.getrlimit(kind)[0]
+            if limit != resource.RLIM_INFINITY:
+                left = min(left, limit - used * float(os.sysconf("SC_PAGE_SIZE")))
+    return left
+
+
+def _left_by_cgroups() -> float:
+    """What the limits of this process's control groups and of those around them leave [bytes], of version 1 or 2."""
+    left = math.inf
+    with suppress(OSError):
+        for line in _OWN_CGROUPS.read_text(encoding="utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            root = _CGROUPS / "memory" if controllers else _CGROUPS
+            names = (
+                ("memory.limit_in_bytes", "memory.usage_in_bytes") if controllers else ("memory.max", "memory.current")
+            )
+            group = root / path.lstrip("/")
+            # In a container the path may be one of the machine's: then its own group is at the root.
+            for folder in (group, *group.parents):
+                if folder == root or root in folder.parents:
+                    left = min(left, _left_in(folder, *names))
+    return left
+
+
+def _left_in(group: Path, limit_name: str, usage_name: str) -> float:
+    """What the limit of one control group leaves [bytes]: infinity if it has none."""
+    with suppress(OSError, ValueError):
+        limit = (group / limit_name).read_text(encoding="ascii").strip()
+        if limit == "max" or int(limit) >= 2**60:
+            return math.inf
+        used = int((group / usage_name).read_text(encoding="ascii"))
+        with suppress(OSError, ValueError):
+            for line in (group / "memory.stat").read_text(encoding="ascii").splitlines():
+                name, value = line.split()
+                if name in ("total_inactive_file", "inactive_file"):
+                    used -= int(value)
+                    break
+        return float(int(limit) - used)
+    return math.inf
 
 
 # Bytes of a scene on the device, measured on the CPU; a GPU takes about as many.

@@ -31,7 +31,7 @@ from warp_ir.film.denoise import denoise_seconds
 from warp_ir.gbuffer import GBuffer, new_gbuffer
 from warp_ir.image.cryptomatte import Cryptomatte
 from warp_ir.interrupt import cancel_on_signal
-from warp_ir.memory import pixel_bytes
+from warp_ir.memory import gibibytes, pixel_bytes
 from warp_ir.reconstruction import BLUR_MODULES, FILTER_MODULES, SCRATCH, Reconstruction, surfaces_move
 from warp_ir.sampling.sobol import stratum
 from warp_ir.scene import InputError, LightKind, Scene
@@ -77,6 +77,7 @@ class Renderer:
         self._shutter: list[_ShutterState] = []
         self._origin: Scene | None = None
         self._layout: _BufferLayout | None = None
+        self._held = 0  # bytes of the pixels
         self._take_settings(scene)
         before = [*([warp_ir.bvh.build] if self.launcher.device.is_cpu else []), *self._estimator_modules()]
         after = [*(FILTER_MODULES if self._resolved.filter else []), *ACCUMULATE_MODULES]
@@ -184,6 +185,7 @@ class Renderer:
         *,
         started: float | None = None,
         reserve: float = 0.0,
+        iterations: range | None = None,
     ) -> Film:
         """Adds iterations to a film until one of the settings' limits is reached; at least one.
 
@@ -196,18 +198,23 @@ class Renderer:
             progress: Called after every iteration.
             started: `time.perf_counter` from which the time counts, before uploading for example; None: this call.
             reserve: Time of the limit that the caller needs after this call, for writing the picture for example [s].
+            iterations: Those that the film is to hold in the end, to be merged with films of others; it may hold the
+                first of them. None: the first ones, up to the limits.
         """
         start = time.perf_counter() if started is None else started
         film = film or self.new_film()
         start -= film.seconds
         with cancel_on_signal(self.launcher, film):
             film.seconds = time.perf_counter() - start
-            scheduler = AdaptiveScheduler(film, self.settings, self._is_adaptive())
+            first, settings = 0, self.settings
+            if iterations is not None:
+                first, settings = iterations.start, replace(settings, iterations=len(iterations))
+            scheduler = AdaptiveScheduler(film, settings, self._is_adaptive())
             profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
-            while not film.interrupted and film.iterations < self.settings.iteration_limit:
+            while not film.interrupted and film.iterations < settings.iteration_limit:
                 try:
-                    self.add_iteration(film, film.iterations)
+                    self.add_iteration(film, first + film.iterations)
                     film.seconds = time.perf_counter() - start
                     spent, samples = profile.since(before), profile.counts["primary_rays"] - rays
                     picture = self._picture_seconds(film, spent["primary"] / samples, spent["film"] / samples)
@@ -248,13 +255,13 @@ class Renderer:
         resolved = wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
-        needed, available = columns * rows * pixel_bytes(scene, resolved), self.launcher.memory()
-        if needed > available:
+        needed = columns * rows * pixel_bytes(scene, resolved)
+        if needed > self._held and needed > (available := self.launcher.memory() + self._held):
             raise InputError(
-                f"width: {columns} x {rows} pixels need about {needed / 2**30:.0f} GiB,"
-                f" {self.launcher.device} has {available / 2**30:.0f}"
+                f"width: {columns} x {rows} pixels need about {gibibytes(needed)},"
+                f" {self.launcher.device} has {gibibytes(available)}"
             )
-        self.wanted, self.settings, self._resolved = wanted, definite, resolved
+        self.wanted, self.settings, self._resolved, self._held = wanted, definite, resolved, needed
 
     def _upload(self, scene: Scene) -> None:
         """Uploads every shutter sample of the scene, and allocates the buffers that an iteration fills in."""

@@ -6,6 +6,7 @@ The flags for `RenderSettings` are generated from its fields: a new field is a n
 import argparse
 import dataclasses
 import math
+import os
 import re
 import types
 import typing
@@ -59,9 +60,13 @@ _TOGETHER: tuple[frozenset[str], ...] = (
 )
 """Destinations of flags: one of them on the command line replaces all of a group in a settings file."""
 _NOT_IN_FILES = frozenset({"help", "settings"})
+_NOT_OF_PICTURE = frozenset(
+    {"part", "preview", "make_output_path", "resume", "checkpoint", "stats", "device", "threads"}
+)
+"""Destinations of flags of `warp-ir render` that its picture does not depend on."""
 _REPEATED = frozenset({"variants"})
 """Destinations of flags that may be repeated."""
-_FILES = ("stage", "output", "ocio_config", "session_layer", "stats", "settings", "log_file")
+_FILES = ("stage", "films", "output", "ocio_config", "session_layer", "stats", "settings", "log_file")
 """Destinations of arguments that are names of files."""
 _PURPOSES = ("default", "render", "proxy", "guide")
 
@@ -86,6 +91,21 @@ examples:
       --session-layer no_lamp.usda
   # the same picture by path tracing, as a check
   warp-ir render room.usda path.png --estimator path --iterations 256
+"""
+_MERGE_NOTES = """\
+The films are all the parts of one picture, in any order. The stage is loaded
+again, and has to be as it was. Flags that are not given here are those that the
+parts were rendered with.
+
+examples:
+  # four machines, or one after the other
+  warp-ir render room.usda 1.exr --part 1/4 --iterations 256
+  warp-ir render room.usda 2.exr --part 2/4 --iterations 256
+  warp-ir render room.usda 3.exr --part 3/4 --iterations 256
+  warp-ir render room.usda 4.exr --part 4/4 --iterations 256
+  # the picture, but for rounding that of 256 iterations in one go
+  warp-ir merge 1.exr.film.npz 2.exr.film.npz 3.exr.film.npz 4.exr.film.npz \\
+      room.exr
 """
 _VPLS_NOTES = """\
 examples:
@@ -170,6 +190,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Raises:
         InputError: The arguments or the settings file are wrong.
     """
+    for word in argv:
+        try:
+            word.encode("utf-8")
+        except UnicodeEncodeError:
+            raise InputError(f"{os.fsencode(word)!r}: is not UTF-8, as names of files and prims must be") from None
     parser, commands = _parsers()
     words = _join_aov_names(argv)
     args, unknown = parser.parse_known_args(words)
@@ -207,7 +232,10 @@ def _words_of_file(path: str, parser: argparse.ArgumentParser, given: Sequence[s
             near = difflib.get_close_matches(key, sorted(set(known) - _NOT_IN_FILES), 1)
             hint = f"; did you mean {near[0]!r}?" if near else f" (see {parser.prog} --help)"
             raise InputError(f"{path}: {key!r} is no flag of {parser.prog}{hint}")
-        found = _words_of_value(path, key, value, action, flags)
+        try:
+            found = _words_of_value(key, value, action, flags)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
         words += found
         kept += found if action.dest not in replaced else []
     positional = ["-" for action in parser._actions if not action.option_strings]
@@ -229,21 +257,63 @@ def _flags_in(words: Sequence[str], flags: Collection[str]) -> Iterator[str]:
                 break
 
 
-def _words_of_value(path: str, key: str, value: object, action: argparse.Action, flags: Collection[str]) -> list[str]:
-    """The words that give the value of a settings file to a flag."""
+def _words_of_value(key: str, value: object, action: argparse.Action, flags: Collection[str]) -> list[str]:
+    """The words that give the value of a settings file to a flag; raises `InputError` if it can have no such value."""
     if action.nargs == 0:
         if not isinstance(value, bool):
-            raise InputError(f"{path}: {key}: must be true or false, is {value!r}")
+            raise InputError(f"{key}: must be true or false, is {value!r}")
         word = f"--{key}" if value else f"--no-{key}"
         return [word] if word in flags else []
     values = value if isinstance(value, list) else [value]
     if any(isinstance(item, bool) or not isinstance(item, str | int | float) for item in values):
-        raise InputError(f"{path}: {key}: must be a number, a text or a list of these, is {value!r}")
+        raise InputError(f"{key}: must be a number, a text or a list of these, is {value!r}")
     texts = [str(item) for item in values]
     if action.nargs is not None:
         return [f"--{key}", *texts]
     # Flags that collect values take one each, others a list with commas.
     return [f"--{key}={text}" for text in (texts if action.dest in _REPEATED else [",".join(texts)])]
+
+
+def preset_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The flags of `warp-ir render` that its picture depends on, where they are not the defaults: name -> value.
+
+    They are those of a settings file, by which the same picture can be made again.
+    """
+    preset: dict[str, Any] = {}
+    for flag, action in _picture_flags().items():
+        value = getattr(args, action.dest, action.default)
+        if value != action.default and value != argparse.SUPPRESS:
+            value = list(value) if isinstance(value, list | tuple) else value
+            preset[flag] = value == action.const if isinstance(action, argparse._StoreConstAction) else value
+    return preset
+
+
+def words_of_preset(preset: Mapping[str, Any]) -> list[str]:
+    """The words of a command line of `warp-ir render` that stand for what `preset_of` has returned.
+
+    Raises:
+        InputError: A key is no such flag, or a value is wrong.
+    """
+    flags, words = _picture_flags(), []
+    known = [word for action in flags.values() for word in action.option_strings]
+    for key, value in preset.items():
+        if key not in flags:
+            raise InputError(f"{key!r} is no flag that a picture depends on")
+        words += _words_of_value(key, value, flags[key], known)
+    return words
+
+
+def _picture_flags() -> dict[str, argparse.Action]:
+    """The flags of `warp-ir render` that its picture depends on, without dashes."""
+    _, commands = _parsers()
+    flags: dict[str, argparse.Action] = {}
+    for group in commands["render"]._action_groups:
+        if group.title in ("picture", "stage", "output"):
+            for action in group._group_actions:
+                names = [word[2:] for word in action.option_strings if word.startswith("--")]
+                if names and action.help != argparse.SUPPRESS and action.dest not in _NOT_OF_PICTURE:
+                    flags[names[0]] = action
+    return flags
 
 
 def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
@@ -260,6 +330,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary, notes, fill in (
         ("render", "render a stage to a picture", _RENDER_NOTES, _add_render),
+        ("merge", "make one picture of films that render --part has written", _MERGE_NOTES, _add_merge),
         ("view", "show a stage in a window in which one moves around, and edit its lights", _VIEW_NOTES, _add_view),
         ("info", "show what a stage contains, what will be skipped, and why", "", _add_info),
         ("vpls", "write the virtual point lights as a picture, page, model, USD or arrays", _VPLS_NOTES, _add_vpls),
@@ -273,7 +344,8 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        command.add_argument("stage", metavar="STAGE", help="USD file (.usd .usda .usdc .usdz)")
+        if name != "merge":
+            command.add_argument("stage", metavar="STAGE", help="USD file (.usd .usda .usdc .usdz)")
         fill(command)
         messages = command.add_argument_group("messages")
         messages.add_argument("--quiet", "-q", action="store_true", help="print nothing but errors")
@@ -349,6 +421,23 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     picture.add_argument("--disableGpu", dest="device", action="store_const", const="cpu", **suppressed)
     _add_stage(parser)
     output = parser.add_argument_group("output")
+    _add_looks(output)
+    part = "render part K of N of the iterations, and write its film alone, OUTPUT.film.npz, for warp-ir merge"
+    output.add_argument("--part", type=_part, metavar="K/N", help=part)
+    preview = "show the picture while it is rendered, in a window, or in a terminal that can"
+    output.add_argument("--preview", action="store_true", help=preview)
+    output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
+    resume = "skip pictures that are there, and continue the one that an earlier command did not finish"
+    output.add_argument("--resume", action="store_true", help=resume)
+    checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
+    output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
+    output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
+    _add_device(output)
+    _add_threads(output)
+
+
+def _add_looks(output: argparse._ArgumentGroup) -> None:
+    """Flags for how a picture that has been rendered is written."""
     output.add_argument(
         "--aov",
         dest="aovs",
@@ -386,16 +475,24 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     mattes = f"Cryptomattes in .exr, by {' or '.join(KINDS)}: coverage counted by 64 more camera rays per pixel"
     output.add_argument("--cryptomatte", type=_names(KINDS), default=[], metavar="NAME[,NAME]", help=mattes)
     output.add_argument("--owner", metavar="TEXT", help="whose picture it is, written to .exr")
-    preview = "show the picture while it is rendered, in a window, or in a terminal that can"
-    output.add_argument("--preview", action="store_true", help=preview)
+
+
+def _add_merge(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("films", nargs="+", metavar="FILM", help="film of a part, OUTPUT.film.npz")
+    parser.add_argument("output", metavar="OUTPUT", help="picture to write")
+    parser.add_argument("--stage", metavar="FILE", help="where the stage is (default: where it was when rendered)")
+    output = parser.add_argument_group("output")
+    _add_looks(output)
     output.add_argument("--make-output-path", action="store_true", help="create the folder of OUTPUT")
-    resume = "skip pictures that exist, and continue the one that an earlier command did not finish"
-    output.add_argument("--resume", action="store_true", help=resume)
-    checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
-    output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
     _add_device(output)
     _add_threads(output)
+    config = "OpenColorIO configuration: a file, or ocio://default (default: as rendered, or $OCIO)"
+    output.add_argument("--ocio-config", metavar="FILE", help=config)
+    for action in parser._actions:  # what is not given is as the films say
+        if action.option_strings and action.dest not in ("stage", "ocio_config"):
+            action.default = argparse.SUPPRESS
+    parser.set_defaults(quiet=False, verbose=False, log_file=None, ocio_config=None)
 
 
 def _add_picture(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse._ArgumentGroup:
@@ -638,6 +735,13 @@ def _duration(text: str) -> float:
 
 def _times(text: str) -> list[float]:
     return sorted({_duration(word) for word in text.split(",")})
+
+
+def _part(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"must be K/N with K from 1 to N, is {text!r}")
+    return int(match[1]), int(match[2])
 
 
 def _count(text: str) -> int:

@@ -22,7 +22,7 @@ from warp_ir.cli.arguments import METHODS, settings_of
 from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, time_code_of
-from warp_ir.image.io import check_output, whole_file
+from warp_ir.files import check_output, whole_file
 from warp_ir.metrics import mean_ratio, relative_mse
 from warp_ir.scene import Floats, InputError, Scene
 

@@ -7,9 +7,10 @@ import sys
 import time
 import traceback
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+from warp_ir.files import special_kind
 from warp_ir.scene import InputError
 
 if TYPE_CHECKING:
@@ -67,7 +68,9 @@ class Messages:
         if file is None:
             return
         try:
-            log = logging.FileHandler(file, encoding="utf-8", errors="backslashreplace")
+            if special_kind(file) == "a pipe":  # to open it would wait for a reader
+                os.close(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
+            log = _LogFile(file, encoding="utf-8", errors="backslashreplace")
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"--log-file: {file!r} cannot be written: {reason}") from error
@@ -98,10 +101,56 @@ class _Stderr(logging.Handler):
             if compiling[0] > 0 and now - self._compiling_line < _COMPILING_LINE_AFTER:
                 return
             self._compiling_line = now
-        if record.exc_info and self.verbose:
-            traceback.print_exception(*record.exc_info)
         kind = "warning: " if record.levelno == logging.WARNING else ""
-        print(f"warp-ir: {kind}{record.getMessage()}", file=sys.stderr, flush=True)
+        with suppress(OSError, ValueError):  # nobody reads it, or it is full: no reason to lose a picture
+            if record.exc_info and self.verbose:
+                traceback.print_exception(*record.exc_info)
+            print(f"warp-ir: {kind}{record.getMessage()}", file=sys.stderr, flush=True)
+
+
+class _LogFile(logging.FileHandler):
+    """Appends records to a file; once it cannot be written, that is said on stderr, and the file is left."""
+
+    _failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        error = sys.exc_info()[1]
+        if not self._failed:
+            self._failed = True
+            reason = getattr(error, "strerror", None) or error
+            text = f"--log-file: {self.baseFilename} cannot be written: {str(reason).lower()}"
+            LOGGER.warning("%s", text, extra={"only": "console"})
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self._failed:
+            super().emit(record)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()
+
+
+def open_closed_streams() -> None:
+    """Opens /dev/null in place of standard streams that are closed.
+
+    Otherwise a file that is opened later takes their place, and what native libraries print goes into it.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+
+
+def discard_stdout() -> None:
+    """Sends what is still to be printed on stdout nowhere, after it could not be written."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def say(message: str, level: int = logging.INFO) -> None:
@@ -115,9 +164,13 @@ def warn(message: str) -> None:
 
 
 def show_result(message: str, *, quiet: bool) -> None:
-    """Prints a result on stdout, unless `quiet` is set, and logs it."""
+    """Prints a line about a result on stdout, unless `quiet` is set, and logs it: the result itself is a file."""
     if not quiet:
-        print(message, flush=True)
+        try:
+            print(message, flush=True)
+        except OSError as error:
+            discard_stdout()
+            warn(f"the standard output cannot be written: {(error.strerror or str(error)).lower()}")
     LOGGER.info("%s", message, extra={"only": "file"})
 
 

@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +21,15 @@ from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_war
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
+from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_part
 from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
+from warp_ir.files import check_output, whole_file
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
-from warp_ir.image.io import DISPLAYED, SUFFIXES, check_output, whole_file, write_image
+from warp_ir.image.io import DISPLAYED, SUFFIXES, aov_path, can_hold_key, read_image, read_key, write_image
 from warp_ir.image.ocio import check_view
 from warp_ir.image.tonemap import TONEMAPS, suggest_exposure
 from warp_ir.scene import InputError, Scene
+from warp_ir.settings import RenderSettings
 
 if TYPE_CHECKING:
     from warp_ir.film import Film
@@ -65,6 +68,8 @@ class _Job:
     reader: "StageReader"
     view: tuple[str, str] | None
     """OpenColorIO's display and view; None: pictures are tone-mapped."""
+    films: Sequence[PartFilm] = ()
+    """The parts that the picture is made of; none: it is rendered."""
     preview: "FilmPreview | None" = None
     renderer: "Renderer | None" = None
     previous_scene: Scene | None = None
@@ -74,10 +79,13 @@ class _Job:
     """Warnings that have been printed."""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Renders the stage's picture, or one for each frame and product; returns the exit code."""
+def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
+    """Renders the stage's picture, or one for each frame and product; returns the exit code.
+
+    With `films` the picture is made of these parts.
+    """
     # All errors of the command line are reported before anything is loaded.
-    settings_of(args)
+    part_of(args, settings_of(args))
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     _check_exr_flags(args, into_folder)
@@ -86,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         outputs = outputs_of(args.output, args.frames, time_code_of(args))
         pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
         for path in outputs.values():
-            check_output(path, make_folder=args.make_output_path)
+            check_output(path, SUFFIXES, make_folder=args.make_output_path)
     if args.stats:
         check_output(args.stats, (".json",), make_folder=args.make_output_path)
     device = open_device(args.device, verbose=args.verbose)
@@ -102,8 +110,10 @@ def run(args: argparse.Namespace) -> int:
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader, view, preview)
-    if into_folder:
+    job = _Job(args, device, versions, reader, view, films, preview)
+    if films:
+        pictures = [_merged_picture(job)]
+    elif into_folder:
         pictures = _products(job)
 
     frames: list[dict[str, Any]] = []
@@ -111,12 +121,13 @@ def run(args: argparse.Namespace) -> int:
     started: float = args.started
     for number, picture in enumerate(pictures, start=1):
         path = next(iter(picture.files))
-        if args.resume and all(file.exists() for file in picture.files) and not checkpoint_path(path).exists():
+        label = path.name if len(pictures) == 1 else f"{path.name} ({number}/{len(pictures)})"
+        rendered = _render_picture(job, picture, label, started)
+        started = time.perf_counter()
+        if rendered is None:
             say(f"{path}: exists and is skipped")
             continue
-        label = path.name if len(pictures) == 1 else f"{path.name} ({number}/{len(pictures)})"
-        statistics, code = _render_picture(job, picture, label, started)
-        started = time.perf_counter()
+        statistics, code = rendered
         if not frames:
             statistics["timings"]["load"] += opened
         frames.append(statistics)
@@ -188,7 +199,7 @@ def _products(job: _Job) -> list[_Picture]:
             if args.frames and "#" in str(name):
                 assert isinstance(code, float)
                 name = outputs_of(str(name), f"{code:g}", None)[code]
-            path = check_output(folder / name, make_folder=args.make_output_path)
+            path = check_output(folder / name, SUFFIXES, make_folder=args.make_output_path)
             if path in taken:
                 raise InputError(f"{product.path}: another RenderProduct is also written to {name}")
             taken.add(path)
@@ -202,8 +213,27 @@ def _products(job: _Job) -> list[_Picture]:
     return pictures
 
 
-def _render_picture(job: _Job, picture: _Picture, label: str, started: float) -> tuple[dict[str, Any], int]:
-    """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code."""
+def _merged_picture(job: _Job) -> _Picture:
+    """The picture that films are parts of.
+
+    Raises:
+        InputError: The output is a folder, or the stage no longer has their RenderProduct.
+    """
+    path, first, code = Path(job.args.output), job.films[0], time_code_of(job.args)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the file to write")
+    products = {product.path: product for product in job.reader.spec(code).products}
+    if first.product is not None and first.product not in products:
+        raise InputError(f"{first.path}: its RenderProduct {first.product} is no longer there")
+    product = None if first.product is None else products[first.product]
+    return _Picture(code, product, {path: None if product is None else product.aovs})
+
+
+def _render_picture(job: _Job, picture: _Picture, label: str, started: float) -> tuple[dict[str, Any], int] | None:
+    """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code.
+
+    None: it is there already, and an earlier command is continued.
+    """
     args = job.args
     path = next(iter(picture.files))
     preview = job.preview
@@ -220,13 +250,27 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         say_warnings((w for w in scene.warnings if w not in job.warned), everything=args.verbose)
         job.warned.update(scene.warnings)
         settings = settings_of(args, scene.settings)
+        key = _picture_key(job, picture, scene, settings)
+        part = part_of(args, settings)
+        if (
+            args.resume
+            and part is None
+            and not checkpoint_path(path).exists()
+            and _is_finished(job, picture, scene, settings, key)
+        ):
+            return None
         if job.renderer is not None and job.renderer.wanted == settings:
             job.renderer.update(scene)
         else:
             job.renderer = ir.Renderer(scene, settings, device=job.device, threads=job.args.threads)
         renderer, film = job.renderer, job.renderer.new_film()
-        checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint)
+        product = None if picture.product is None else picture.product.path
+        note = "" if part is None else note_of(part, args, picture.time, product)
+        checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint, note)
+        _check_part(part, checkpoint.path, resume=args.resume)
         if args.resume and checkpoint.resume():
+            if part is not None and film.iterations >= len(part.iterations):
+                return None
             say(f"{path}: continues after {film.iterations} iterations")
 
         def report(progress: "Progress") -> None:
@@ -239,7 +283,15 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         begin = time.perf_counter()
         exr = _exr_options(job, picture)  # before the render, so that its camera rays are within the time limit
         reserve = job.write_seconds or _WRITE_SECONDS[0] + _WRITE_SECONDS[1] * film.width * film.height
-        renderer.render(film, report, started=started, reserve=reserve)
+        try:
+            if job.films:
+                _merge(job.films, film, renderer, fingerprint(scene, renderer.settings))
+            else:
+                iterations = None if part is None else part.iterations
+                renderer.render(film, report, started=started, reserve=reserve, iterations=iterations)
+        except MemoryError as error:
+            _say_saved(checkpoint.keep(), checkpoint, f"out of memory: {error}")
+            raise
         render_seconds = time.perf_counter() - begin
         if preview is not None:
             preview(film, label, last=True)
@@ -249,34 +301,48 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     code = 128 + stop_signal if stop_signal else 0
     written: list[Path] = []
     write_warnings: list[str] = []
-    if film.iterations or not stop_signal:
+    failure = ""
+    if part is None and (film.iterations or not stop_signal):
         begin = time.perf_counter()
         metadata: dict[str, object] = {
             **job.versions,
             "stage": str(args.stage),
             "camera": scene.camera.name,
             "device": job.device,
+            "key": "" if stop_signal else key,
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            for file, aovs in picture.files.items():
-                written += write_image(
-                    file,
-                    film,
-                    aovs=_aovs(args, job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs, file),
-                    exposure=args.exposure,
-                    tonemap=args.tonemap or TONEMAPS[0],
-                    view=job.view,
-                    half=args.half,
-                    metadata=metadata,
-                    exr=exr,
-                )
+            try:
+                for file in picture.files:
+                    written += write_image(
+                        file,
+                        film,
+                        aovs=_aovs(job, picture, file),
+                        exposure=args.exposure,
+                        tonemap=args.tonemap or TONEMAPS[0],
+                        view=job.view,
+                        half=args.half,
+                        metadata=metadata,
+                        exr=exr,
+                    )
+            except InputError as error:
+                failure, code = str(error), code or 1
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
         job.write_seconds = timings["write"]
-    if not stop_signal:
+    if part is not None and not stop_signal:
+        saved = checkpoint.keep()
+        if saved != checkpoint.path:
+            _say_saved(saved, checkpoint, f"{checkpoint.path}: cannot be written")
+            code = 1
+        else:
+            written = [saved]
+    elif failure:
+        _say_saved(checkpoint.keep(), checkpoint, failure)
+    elif not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
         say(f"{checkpoint.path}: --resume continues from this checkpoint")
@@ -288,7 +354,9 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         late = f"the picture took {film.seconds:.2g} s, as one iteration is the least"
         picture_warnings.append(f"--time-limit {settings.time_limit:g}: {late}")
     say_warnings(picture_warnings)
-    _summarize(job, path, film, written=bool(written), blank=bool(blank))
+    _summarize(
+        job, written[0] if part is not None and written else path, film, written=bool(written), blank=bool(blank)
+    )
     statistics = {
         "output": [str(file) for file in written],
         "frame": picture.time,
@@ -350,11 +418,75 @@ def _count_reused(previous: Sequence[object], current: Sequence[object]) -> int:
     return sum(id(item) in ids for item in current)
 
 
-def _aovs(args: argparse.Namespace, from_stage: Sequence[str], path: Path) -> tuple[str, ...]:
-    """The AOVs to write: those of the command line, else those of the stage if the format has layers."""
-    if args.aovs or path.suffix.lower() != ".exr":
-        return tuple(dict.fromkeys(args.aovs))
+def _aovs(job: _Job, picture: _Picture, path: Path) -> tuple[str, ...]:
+    """The AOVs to write to a file: those of the command line, else those of the stage if the format has layers."""
+    if job.args.aovs or path.suffix.lower() != ".exr":
+        return tuple(dict.fromkeys(job.args.aovs))
+    aovs = picture.files[path]
+    from_stage = job.reader.spec(picture.time).products[0].aovs if aovs is None else aovs
     return tuple(name for name in from_stage if name != "alpha")  # every .exr has alpha
+
+
+def _picture_key(job: _Job, picture: _Picture, scene: Scene, settings: RenderSettings) -> str:
+    """A hash of all that the pixels depend on, by which --resume knows the picture; "" if it cannot be stored."""
+    args = job.args
+    if not any(can_hold_key(file) for file in picture.files):
+        return ""
+    aovs = [_aovs(job, picture, file) for file in picture.files]
+    shown = args.exposure, args.tonemap or TONEMAPS[0], job.view, args.half, args.cryptomatte, aovs
+    return fingerprint(scene, settings, *shown)
+
+
+def _is_finished(job: _Job, picture: _Picture, scene: Scene, settings: RenderSettings, key: str) -> bool:
+    """Whether all files of a picture are there, of its size, and of its key as far as their formats hold one."""
+    height = settings.resolve(scene.camera.aspect).height
+    _, _, columns, rows = replace(settings, height=height).pixels()
+    for file in picture.files:
+        aovs = () if file.suffix.lower() == ".exr" else _aovs(job, picture, file)
+        for path in (file, *(aov_path(file, name) for name in aovs)):
+            if not path.exists():
+                return False
+            try:
+                good = read_image(path).shape[:2] == (rows, columns) and read_key(path) in (None, key)
+            except InputError:
+                good = False
+            if not good:
+                say(f"{path}: is not this picture, or not finished: it is rendered anew")
+                return False
+    return True
+
+
+def _check_part(part: Part | None, film: Path, *, resume: bool) -> None:
+    """Raises `InputError` if the film that is there is of another part: one must not take the other's place."""
+    if not film.exists() or (part is None and not resume):
+        return
+    from warp_ir.film import read_state
+
+    other = read_part(film).part if read_state(film).note else None
+    if other != part:
+        holds = "a whole picture" if other is None else f"{other} of {other.total} iterations"
+        raise InputError(f"{film}: holds {holds}: name another OUTPUT, or remove it")
+
+
+def _merge(films: Sequence[PartFilm], film: "Film", renderer: "Renderer", key: str) -> None:
+    """Makes an empty film the whole of its parts, which are merged in their order: always to the same bits."""
+    film.resume(films[0].path, key)
+    for part in films[1:]:
+        other = renderer.new_film()
+        other.resume(part.path, key)
+        film.merge(other)
+
+
+def _say_saved(saved: Path | None, checkpoint: Checkpoint, failure: str) -> None:
+    """Says that the picture could not be written, and where its film lies."""
+    if saved is None:
+        say(f"error: {failure}; there is no room for its film either", logging.ERROR)
+    elif saved == checkpoint.path:
+        say(f"error: {failure}; its film is kept in {saved}, from which --resume continues", logging.ERROR)
+    else:
+        say(
+            f"error: {failure}; its film is kept in {saved}: as {checkpoint.path}, --resume continues it", logging.ERROR
+        )
 
 
 def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: bool) -> None:

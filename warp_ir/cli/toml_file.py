@@ -3,7 +3,7 @@
 import sys
 from typing import Any
 
-from warp_ir.image.io import check_input
+from warp_ir.files import check_input
 from warp_ir.scene import InputError
 
 

@@ -15,7 +15,8 @@ from warp_ir.cli.console import ProgressDisplay, say, say_warnings, show_result
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.import_guard import importing
 from warp_ir.cli.stage_options import open_reader, time_code_of
-from warp_ir.image.io import SUFFIXES, check_output
+from warp_ir.files import check_output
+from warp_ir.image.io import SUFFIXES
 from warp_ir.view.access import check_address, check_display
 
 if TYPE_CHECKING:

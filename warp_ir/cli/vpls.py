@@ -12,7 +12,7 @@ from warp_ir.cli.arguments import VPL_DRAWING, settings_of
 from warp_ir.cli.console import muted_stderr, say, say_warnings, show_result
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.stage_options import open_reader, stage_facts, time_code_of
-from warp_ir.image.io import check_output, whole_file
+from warp_ir.files import check_output, whole_file
 from warp_ir.scene import InputError, Scene
 
 if TYPE_CHECKING:

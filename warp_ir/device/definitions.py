@@ -6,8 +6,9 @@ cache can be loaded without either. So this module
 
 * puts off what `wp.func`, `wp.func_native` and `wp.kernel` do until something is asked of a function, or Warp has to
   load a module (`put_off`);
-* writes a record for every module that Warp has loaded: the file of its code, and the symbols of its kernels. It lies
-  in Warp's cache and is named by a hash of the package's text, of Warp's configuration and of the CPU's features.
+* writes a record for every module that Warp has loaded: the file of its code, its checksum, and the symbols of its
+  kernels. It lies in Warp's cache and is named by a hash of the package's text, of Warp's configuration and of the
+  CPU's features.
 
 A module that has no such record is loaded by Warp, and so is every module on a GPU. What is called here of Warp is not
 public (`_llvm`, `Command`, `record`); with another version than `_WARP` nothing is put off, and Warp does it all.
@@ -153,11 +154,12 @@ def load(module: Any) -> bool:
             return False
         try:
             entry = json.loads(_record_path(module).read_text())
-        except (OSError, ValueError):
+            path = os.path.join(str(wp.config.kernel_cache_dir), entry["file"])
+            symbols, damaged = entry["symbols"], checksum(path) != entry["checksum"]
+        except (OSError, ValueError, LookupError, TypeError):
             return False
-        symbols, handle = entry["symbols"], f"warp_ir_{module.name}".encode()
-        path = os.path.join(str(wp.config.kernel_cache_dir), entry["file"])
-        if not os.path.exists(path) or _llvm().wp_load_obj(path.encode(), handle, wp.config.legacy_cpu_linker) != 0:
+        handle = f"warp_ir_{module.name}".encode()
+        if damaged or _llvm().wp_load_obj(path.encode(), handle, wp.config.legacy_cpu_linker) != 0:
             return False
         entry_point = ctypes.CFUNCTYPE(None)
         addresses = {name: _llvm().wp_lookup(handle, symbol.encode()) for name, symbol in symbols.items()}
@@ -173,15 +175,22 @@ def record(module: Any, device: Any) -> None:
         return
     loaded = module.load(device, 1)
     symbols = {key: loaded.get_kernel_mangled_name(kernel) + "_cpu_forward" for key, kernel in module.kernels.items()}
-    entry = {"file": os.path.relpath(loaded.binary_path, wp.config.kernel_cache_dir), "symbols": symbols}
+    file = os.path.relpath(loaded.binary_path, wp.config.kernel_cache_dir)
     path = _record_path(module)
     temporary = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
     try:
+        entry = {"file": file, "checksum": checksum(loaded.binary_path), "symbols": symbols}
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_text(json.dumps(entry))
         temporary.replace(path)
-    except OSError:  # the cache is read-only: the next start is as slow as this one
+    except OSError:  # the cache is read-only, or gone: the next start is as slow as this one
         return
+
+
+def checksum(path: str) -> str:
+    """A checksum of a file."""
+    with open(path, "rb") as file:
+        return hashlib.blake2b(file.read(), digest_size=16).hexdigest()
 
 
 def _record_path(module: Any) -> Path:

@@ -8,7 +8,7 @@ result does not depend on the bands.
 Short launches, and work on the host, keep only one thread busy. `Launcher.overlap` gives the others something to do.
 """
 
-import math
+import logging
 import os
 import threading
 import time
@@ -19,11 +19,13 @@ from typing import Any, TypeVar
 
 import warp as wp
 
-from warp_ir.device.compiling import ModuleLoader
+from warp_ir.device.compiling import ModuleLoader, start_warp
 from warp_ir.device.definitions import Command, defined, is_loaded
 from warp_ir.device.profiling import Profile
+from warp_ir.memory import available_memory
 from warp_ir.scene import InputError
 
+_LOGGER = logging.getLogger("warp_ir")
 _MIN_BANDS = 16
 """Least number of bands of a launch, so that Ctrl-C need not wait for long."""
 _MAX_BANDS_PER_THREAD = 64
@@ -81,8 +83,10 @@ class Launcher:
             threads: CPU threads; by default one for each core this process may use.
 
         Raises:
-            InputError: There is no such device.
+            InputError: There is no such device, or no folder for compiled kernels.
         """
+        if warning := start_warp():
+            _LOGGER.warning("%s", warning)
         try:
             self.device = wp.get_device(device)
         except (ValueError, RuntimeError) as error:
@@ -364,13 +368,8 @@ class Launcher:
         self.profile.counts["graph_launches"] += 1
 
     def memory(self) -> float:
-        """Bytes that may be allocated: the free memory of a GPU, the whole memory of a CPU; infinity if unknown."""
-        if self.device.is_cuda:
-            return float(self.device.free_memory)
-        try:
-            return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        except (AttributeError, OSError, ValueError):
-            return math.inf
+        """Bytes that may be allocated: the free memory of a GPU, or what this process may have; infinity if unknown."""
+        return float(self.device.free_memory) if self.device.is_cuda else available_memory()
 
     def max_light_paths(self) -> int:
         """Largest default number of light paths, a power of two.
@@ -383,7 +382,8 @@ class Launcher:
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An uninitialised array on the device."""
-        return wp.empty(shape, dtype=dtype, device=self.device)
+        with _allocating():
+            return wp.empty(shape, dtype=dtype, device=self.device)
 
     def row_count(self, number: Any, limit: int) -> int:
         """Number of rows to allocate and to launch for, given the number on the device [1] and its upper limit.
@@ -394,11 +394,24 @@ class Launcher:
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """An array of zeros on the device."""
-        return wp.zeros(shape, dtype=dtype, device=self.device)
+        with _allocating():
+            return wp.zeros(shape, dtype=dtype, device=self.device)
 
     def array(self, data: Any, dtype: Any) -> Any:
         """A copy of host data on the device."""
-        return wp.array(data, dtype=dtype, device=self.device)
+        with _allocating():
+            return wp.array(data, dtype=dtype, device=self.device)
+
+
+@contextmanager
+def _allocating() -> Iterator[None]:
+    """Raises `MemoryError` where Warp raises another error because there is not enough memory."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "allocate" in str(error):
+            raise MemoryError(str(error).lower()) from error
+        raise
 
 
 def partition(block: Any, rows: int, dtypes: Sequence[Any]) -> list[Any]:

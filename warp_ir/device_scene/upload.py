@@ -104,7 +104,7 @@ def upload_scenes(
     with launcher.phase("upload"):
         checked = {id(x) for other in previous for x in (*other.source.meshes, *other.source.materials)}
         for scene in scenes:
-            check_scene(scene, launcher, checked)
+            check_scene(scene, launcher, checked, [other.source for other in previous])
             checked |= {id(x) for x in (*scene.meshes, *scene.materials)}
         bounds = [scene.bounds() for scene in scenes]
         lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)

@@ -1,30 +1,33 @@
 """Checks of a scene before it is uploaded."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.geometry_storage import emissive_meshes
+from warp_ir.memory import gibibytes
 from warp_ir.scene import MAX_RADIANCE, InputError, LightKind, Material, Mesh, Scene, materials_of
 
 MAX_TRIANGLES = 200_000_000
 """Largest number of triangles of a scene; one with more is rejected before anything is allocated."""
-_BYTES_PER_TRIANGLE = 200
-_BYTES_PER_INSTANCE = 400
+_BYTES_PER_TRIANGLE = 300
+_BYTES_PER_INSTANCE = 560
+"""Memory of the upload, at its peak: measured for ten million of each."""
 _MAX_EXPOSED_RADIANCE = 1.0e38
 """Largest radiance times exposure, which a film stores as float32."""
 _MAX_NORMAL_COMPONENT = 1.0e6
 """Largest component of a normal map, so that its square is finite."""
 
 
-def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> None:
+def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int], previous: Sequence[Scene] = ()) -> None:
     """Checks shapes, indices, ranges and size of a scene: kernels do not, and a bad index would read any memory.
 
     Args:
         scene: The scene.
         launcher: Launcher of the device, whose memory has to suffice.
         checked: The ids of meshes and materials that need no check, because they have passed it.
+        previous: Scenes on the device that it replaces.
 
     Raises:
         InputError: Something is not usable; the message names the mesh, material or light.
@@ -36,18 +39,16 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int]) -> N
         if used and not 0 <= used[0] <= used[-1] < len(scene.materials):
             raise InputError(f"{mesh.name}: material refers to materials outside 0..{len(scene.materials) - 1}")
     _check_instances(scene)
-    emissive = emissive_meshes(scene)
-    flattened = [(g, k) for g in scene.instances for k in g.meshes if k in emissive]
-    copied = sum((len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in flattened)
-    triangles, instances = scene.triangle_count + copied, sum(len(g.matrices) for g in scene.instances)
+    triangles, copied, instances = _sizes(scene)
     if triangles > MAX_TRIANGLES:
-        copies = f", {copied} of them copies of instances that emit" if flattened else ""
+        copies = f", {copied} of them copies of instances that emit" if copied else ""
         raise InputError(f"scene: {triangles} triangles{copies}; the limit is {MAX_TRIANGLES}")
-    needed = _BYTES_PER_TRIANGLE * triangles + _BYTES_PER_INSTANCE * instances
-    if needed > launcher.memory():
+    needed, *before = (_BYTES_PER_TRIANGLE * n + _BYTES_PER_INSTANCE * k for n, _, k in map(_sizes, (scene, *previous)))
+    held = max(before, default=0)
+    if needed > held and needed > (available := launcher.memory() + held):
         raise InputError(
-            f"scene: {triangles} triangles and {instances} instances need about {needed / 2**30:.1f} GiB,"
-            f" {launcher.device} has {launcher.memory() / 2**30:.1f}"
+            f"scene: {triangles} triangles and {instances} instances need about {gibibytes(needed)},"
+            f" {launcher.device} has {gibibytes(available)}"
         )
     for material in scene.materials:
         if id(material) in checked:
@@ -128,6 +129,14 @@ def _check_instances(scene: Scene) -> None:
         if group.colors is not None:
             demand(group.colors.shape == (count, 3), "colors must have shape [k, 3], one per instance")
             demand(group.colors.min() >= 0.0 and group.colors.max() <= 1.0, "colors must lie in [0, 1]")
+
+
+def _sizes(scene: Scene) -> tuple[int, int, int]:
+    """Number of stored triangles, of those that are copies because their instances emit, and of instances."""
+    emissive = emissive_meshes(scene)
+    flattened = [(group, k) for group in scene.instances for k in group.meshes if k in emissive]
+    copied = sum((len(group.matrices) - 1) * len(scene.meshes[k].triangles) for group, k in flattened)
+    return scene.triangle_count + copied, copied, sum(len(group.matrices) for group in scene.instances)
 
 
 def _check_mesh(mesh: Mesh) -> None:

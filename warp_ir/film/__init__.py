@@ -2,8 +2,9 @@
 
 from warp_ir.film import accumulate
 from warp_ir.film.film import Film
+from warp_ir.film.storage import read_state
 
 ACCUMULATE_MODULES = (accumulate,)
 """Modules with the kernels that every film needs."""
 
-__all__ = ["ACCUMULATE_MODULES", "Film"]
+__all__ = ["ACCUMULATE_MODULES", "Film", "read_state"]

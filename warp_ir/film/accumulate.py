@@ -34,8 +34,8 @@ class FilmData:
     mesh: wp.array[wp.int32]  # index into Scene.meshes, from the first iteration; -1: background
 
 
-FIELDS: tuple[str, ...] = tuple(FilmData.vars)
-"""Names of the arrays of a `FilmData`."""
+FIELDS: dict[str, Any] = {name: field.type.dtype for name, field in FilmData.vars.items()}
+"""The arrays of a `FilmData`: name -> Warp's type of a row."""
 
 
 @wp.func

@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +19,23 @@ from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, 
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
 from warp_ir.film.picture_noise import PictureNoise, tile_sums
-from warp_ir.film.storage import FilmState, read_arrays, read_noise, read_state, reconstruction_names, write_film
+from warp_ir.film.storage import (
+    FilmFile,
+    FilmState,
+    check_counts,
+    layout_of,
+    open_film,
+    reconstruction_names,
+    write_film,
+)
 from warp_ir.gbuffer import GBuffer
 from warp_ir.image.io import write_image
 from warp_ir.scene import InputError
 from warp_ir.settings import RenderSettings
 from warp_ir.tiles import TILE, Tiles, all_tiles, some_tiles, tile_count
+
+if TYPE_CHECKING:
+    from typing import Self  # Python 3.11
 
 AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alpha", "prim_id")
 """Names that `Film.aov` accepts."""
@@ -61,7 +72,7 @@ class PictureFilter(Protocol):
     def arrays(self) -> dict[str, "wp.array[Any]"]:
         """The sums over the samples by name; they are saved with the film."""
 
-    def merge(self, other: Self) -> None:
+    def merge(self, other: "Self") -> None:
         """Adds the samples of another film's filter."""
 
     def cost(self, iterations: int) -> tuple[float, float]:
@@ -499,14 +510,15 @@ class Film:
         return f'<img src="data:image/png;base64,{data}" alt="{caption}"><br>{caption}'
 
     @_exclusive
-    def save(self, path: str | os.PathLike[str], key: str = "") -> None:
+    def save(self, path: str | os.PathLike[str], key: str = "", note: str = "") -> None:
         """Writes the film and the samples of its filter as .npz; `load` and `resume` restore it bit for bit.
 
         Args:
             path: The file.
             key: Identifies the scene and the settings; `resume` compares it.
+            note: A text of the caller's, which is stored with it.
         """
-        state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame)
+        state = FilmState(key, self.width, self.height, self.iterations, self.seconds, self.chosen, self._frame, note)
         write_film(path, state, self._saved_arrays(), self._noise)
 
     def resume(self, path: str | os.PathLike[str], key: str = "") -> None:
@@ -515,15 +527,13 @@ class Film:
         Raises:
             InputError: The file is missing, is no film, or is one of another scene or size.
         """
-        state = read_state(path)
-        if state.key != key or (state.width, state.height) != (self.width, self.height):
-            raise InputError(f"{os.fspath(path)}: a film of another scene, or with other settings")
-        arrays = self._saved_arrays()
-        stored = read_arrays(path, arrays)
-        if any(stored[name].shape[0] != array.shape[0] for name, array in arrays.items()):
-            raise InputError(f"{os.fspath(path)}: not a film: its arrays differ in size")
-        self._restore(state, arrays, stored)
-        self._noise = read_noise(path)
+        with open_film(path) as file:
+            state = file.state
+            if state.key != key or (state.width, state.height) != (self.width, self.height):
+                raise InputError(f"{os.fspath(path)}: a film of another scene, or with other settings")
+            noise = file.read_noise()
+            self._restore(file, self._saved_arrays())
+            self._noise = noise
 
     @staticmethod
     def load(path: str | os.PathLike[str], device: str = "cpu") -> "Film":
@@ -532,11 +542,20 @@ class Film:
         Raises:
             InputError: The file is missing or is no film.
         """
-        state = read_state(path)
-        stored = read_arrays(path, FIELDS)
-        rows = {"has_emission": len(stored["emission"]) > 0, "sees_lights": len(stored["lights"]) > 0}
-        film = Film(state.width, state.height, Launcher(device), state.frame, **rows)
-        film._restore(state, film_arrays(film._data), stored)
+        with open_film(path) as file:
+            state, pixels = file.state, file.state.width * file.state.height
+            rows = {name: pixels if file.rows(name) else 0 for name in ("emission", "lights")}
+            for name, dtype in FIELDS.items():  # before memory is taken
+                file.check_layout(name, layout_of(dtype, rows.get(name, pixels)))
+            film = Film(
+                state.width,
+                state.height,
+                Launcher(device),
+                state.frame,
+                has_emission=rows["emission"] > 0,
+                sees_lights=rows["lights"] > 0,
+            )
+            film._restore(file, film_arrays(film._data))
         return film
 
     def _saved_arrays(self) -> "dict[str, wp.array[Any]]":
@@ -546,16 +565,17 @@ class Film:
             arrays |= reconstruction_names(self.reconstruction.arrays())
         return arrays
 
-    def _restore(
-        self, state: FilmState, arrays: "dict[str, wp.array[Any]]", stored: dict[str, npt.NDArray[Any]]
-    ) -> None:
+    def _restore(self, file: FilmFile, arrays: "dict[str, wp.array[Any]]") -> None:
         """Copies stored arrays into those of the same name, and takes over the rest of the state."""
+        stored = file.read({name: layout_of(array.dtype, len(array)) for name, array in arrays.items()})
+        meshes = getattr(self.origin, "meshes", None)
+        check_counts(file, stored, None if meshes is None else len(meshes))
         for name, array in arrays.items():
             array.assign(stored[name])
-        self.iterations, self.seconds = state.iterations, state.seconds
+        self.iterations, self.seconds = file.state.iterations, file.state.seconds
         count = self._data.count.numpy().reshape(self.height, self.width)
         self._skipped = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
-        self.choose(state.chosen)
+        self.choose(file.state.chosen)
 
     def _radiance_of(self, *names: str) -> npt.NDArray[np.float32]:
         """Sum of some fields of `FilmData`, float32 [height, width, 3]; always a copy."""

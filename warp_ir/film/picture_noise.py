@@ -6,12 +6,15 @@ f = m/n. Unlike the spread of single pixels, this contains what the filter gains
 """
 
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ir.tiles import TILE
+
+if TYPE_CHECKING:
+    from typing import Self  # Python 3.11
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,11 +37,11 @@ class PictureNoise:
     """[2, tiles], sums of relative squared noise over a tile times its iterations; the latest first, NaN: unknown."""
 
     @classmethod
-    def first(cls, picture: npt.NDArray[np.float32], iterations: npt.NDArray[np.int32]) -> Self:
+    def first(cls, picture: npt.NDArray[np.float32], iterations: npt.NDArray[np.int32]) -> "Self":
         """What the first picture tells: nothing yet."""
         return cls(picture, iterations, np.full((2, len(iterations)), np.nan))
 
-    def updated(self, picture: npt.NDArray[np.float32], iterations: npt.NDArray[np.int32]) -> Self:
+    def updated(self, picture: npt.NDArray[np.float32], iterations: npt.NDArray[np.int32]) -> "Self":
         """Adds a later picture; tiles without new iterations keep the estimate that they have."""
         fraction = self.iterations / iterations
         change = tile_sums((picture - self.picture).astype(np.float64) ** 2 / _scale(picture))

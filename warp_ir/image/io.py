@@ -1,14 +1,12 @@
-"""Reading and writing pictures; a file is written completely or not at all.
+"""Reading and writing pictures.
 
 `.exr`, `.hdr`, `.pfm` and `.npy` hold linear radiance, `.png`, `.jpg` and `.tif` tone-mapped display values.
 """
 
 import json
 import os
-import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -16,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from warp_ir.files import check_output, check_room, first_line, reason, whole_file
 from warp_ir.image.color_space import COLOR_SPACES, REC709
 from warp_ir.image.exr import ExrOptions, camera_matrices
 from warp_ir.image.ocio import active_config, check_color_space, display_values, to_color_space
@@ -47,6 +46,7 @@ SUFFIXES = (".exr", ".hdr", ".pfm", ".npy", *DISPLAYED)
 _HALF_MAX = 65504.0
 _FULL_FLOAT_AOVS = frozenset({"position", "depth", "prim_id"})
 """AOVs that a half-float file stores with 32 bits: 11 bits of precision are too few for distances and indices."""
+_KEY = "warp_ir:key"
 _LIGHT = frozenset({None, "direct", "indirect"})
 """AOVs that are radiance; None stands for the whole."""
 _COLORS = _LIGHT | {"albedo"}
@@ -57,11 +57,12 @@ _EXR = ExrOptions()
 
 
 class _Shown(NamedTuple):
-    """How linear radiance becomes display values; the arguments of `write_image`."""
+    """How linear radiance becomes display values, and the picture's key; the arguments of `write_image`."""
 
     exposure: float
     tonemap: str
     view: tuple[str, str] | None
+    key: str
 
 
 class _Layer(NamedTuple):
@@ -136,7 +137,8 @@ def write_image(
             to a file of its own: picture.NAME.png for picture.png.
         half: Whether an EXR file stores colours with 16 bits; values beyond ±65504 are clamped,
             with a warning that counts their pixels.
-        metadata: Attributes for an EXR file, in addition to the film's settings and statistics.
+        metadata: Attributes for an EXR file, in addition to the film's settings and statistics. Of these, "key" is
+            also stored in `.png`, `.jpg` and `.tif`, for `read_key`.
         color_space: One of `COLOR_SPACES`, or a linear one of that configuration, for colours in the linear formats;
             None: that of the film's settings, or linear Rec. 709 for an array.
         exr: How an EXR file is stored, and its Cryptomattes. Those of a film that a `Renderer` made have the camera's
@@ -148,7 +150,7 @@ def write_image(
     Raises:
         InputError: The path cannot be written, or the extension, AOV, tone curve or colour space is unknown.
     """
-    path = check_output(path)
+    path = check_output(path, SUFFIXES)
     if color_space is None:
         settings = None if isinstance(source, np.ndarray) else source.settings
         color_space = REC709 if settings is None else settings.color_space
@@ -165,7 +167,7 @@ def write_image(
         attributes |= _color_attributes(color_space)
         _write_exr(path, layers, half, attributes, exr, _data_window(source))
         return [path]
-    shown = _Shown(exposure, tonemap, view)
+    shown = _Shown(exposure, tonemap, view, str((metadata or {}).get("key") or ""))
     _write_single_layer(path, source, shown, aov, color_space)
     aov_paths = [aov_path(path, name) for name in aovs]
     for name, other in zip(aovs, aov_paths, strict=True):
@@ -189,7 +191,7 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
         try:
             values = np.asarray(np.load(path, allow_pickle=False), dtype=np.float32)
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path}: {_reason(error)}") from error
+            raise InputError(f"{path}: {reason(error)}") from error
         if values.ndim not in (2, 3):
             raise InputError(f"{path}: an array of {values.ndim} dimensions is no picture")
         return values[..., None] if values.ndim == 2 else values
@@ -224,93 +226,38 @@ def read_image(path: str | os.PathLike[str], layer: str | None = None) -> npt.ND
     return np.ascontiguousarray(pixels[..., [names.index(name) for name in wanted]])
 
 
+def can_hold_key(path: Path) -> bool:
+    """Whether the format of a file has a place for the key of a picture."""
+    return path.suffix.lower() in (".exr", *DISPLAYED)
+
+
+def read_key(path: Path) -> str | None:
+    """The key that `write_image` has stored with a picture, "" if there is none; None: the format has no place for it.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    if not can_hold_key(path):
+        return None
+    import OpenImageIO as oiio
+
+    reader = oiio.ImageInput.open(str(path))
+    if reader is None:
+        raise InputError(f"{path}: {oiio_error()}")
+    try:
+        if path.suffix.lower() == ".exr":
+            return str(reader.spec().get_string_attribute(_KEY))
+        name, _, key = str(reader.spec().get_string_attribute("ImageDescription")).partition(" ")
+        return key if name == _KEY else ""
+    except UnicodeDecodeError:
+        return ""
+    finally:
+        reader.close()
+
+
 def aov_path(path: Path, aov: str) -> Path:
     """Path of an AOV of `path` in a format without layers: a.png -> a.depth.png."""
     return path.with_name(f"{path.stem}.{aov}{path.suffix}")
-
-
-def check_input(path: str | os.PathLike[str], kind: str) -> None:
-    """Checks that a file can be read, as far as that costs no time.
-
-    Args:
-        path: The file.
-        kind: What it should be, such as "a USD file".
-
-    Raises:
-        InputError: There is no such file, or it is a folder.
-    """
-    if not os.path.exists(path):
-        raise InputError(f"{os.fspath(path)}: no such file")
-    if os.path.isdir(path):
-        raise InputError(f"{os.fspath(path)}: is a directory, not {kind}")
-
-
-def check_output(
-    path: str | os.PathLike[str], suffixes: Sequence[str] = SUFFIXES, *, make_folder: bool = False
-) -> Path:
-    """Checks that a file can be written, before any work is done for it.
-
-    Args:
-        path: The file to write.
-        suffixes: The known extensions, in lower case.
-        make_folder: Whether to create the file's folder.
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    path = Path(path)
-    try:
-        if "\0" in str(path):
-            raise InputError(f"{str(path)!r}: a path cannot hold a null character")
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder; name the file to write")
-        if path.suffix.lower() not in suffixes:
-            raise InputError(f"{path}: unknown extension {path.suffix!r}; known are {' '.join(suffixes)}")
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: is not a regular file")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise InputError(f"{path}: is write-protected")
-        if make_folder:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        elif not path.parent.exists():
-            raise InputError(f"{path}: there is no folder {str(path.parent)!r}")
-        # Permissions, read-only and full file systems show only when a file is created.
-        temporary = _temporary(path)
-        temporary.open("xb").close()
-        temporary.unlink()
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be written: {_reason(error)}") from error
-    return path
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary path in the same folder, which replaces `path` on success and is removed otherwise.
-
-    Raises:
-        InputError: Writing failed.
-    """
-    # A link is followed: its target is replaced, and not the link.
-    target = Path(os.path.realpath(path))
-    temporary = _temporary(target)
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {_reason(error)}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def _temporary(path: Path) -> Path:
-    """A hidden path in the same folder, with the same extension, that no other process uses."""
-    return path.with_name(f".warp-ir-{os.getpid()}-{os.urandom(4).hex()}{path.suffix}")
 
 
 def _pixels(source: "_Film | Array", aov: str | None) -> tuple[Array, Array | None]:
@@ -486,6 +433,8 @@ def _write_single_layer(path: Path, source: "_Film | Array", how: _Shown, aov: s
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     config = active_config() if how.view is not None and aov in _LIGHT else None
     spec.set_colorspace("sRGB" if config is None or how.view is None else config.display_space(how.view))
+    if how.key:
+        spec.attribute("ImageDescription", f"{_KEY} {how.key}")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("Compression", "jpeg:95" if suffix in (".jpg", ".jpeg") else "zip")
     _save(path, [spec], [pixels])
@@ -513,10 +462,9 @@ def _save(path: Path, specs: "Sequence[oiio.ImageSpec]", parts: "Sequence[Array 
     """Writes the parts of a file, mostly one, with OpenImageIO; raises `InputError` if that fails in any way."""
     import OpenImageIO as oiio
 
-    if path.suffix.lower() in (".jpg", ".jpeg") and shutil.disk_usage(path.parent).free < 2 * parts[0].nbytes:
-        # libjpeg exits the process when it cannot write.
-        raise InputError(f"{path}: cannot be written: no space left on the device")
     with whole_file(path) as temporary:
+        if path.suffix.lower() in (".jpg", ".jpeg"):
+            check_room(temporary.parent, 2 * parts[0].nbytes)  # libjpeg exits the process when it cannot write
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
             raise OSError(oiio_error())
@@ -551,20 +499,6 @@ def _attributes(source: "_Film | Array", metadata: Mapping[str, object]) -> dict
         elif value is not None:
             attributes[f"warp_ir:{name}"] = str(value)
     return attributes
-
-
-def _reason(error: Exception) -> str:
-    """The reason of an error, without the path, which the message names already."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror.lower()
-    return first_line(str(error))
-
-
-def first_line(text: str) -> str:
-    """The first line of a message, "" if it has none; characters that cannot be printed are replaced."""
-    lines = text.strip().splitlines()
-    line = lines[0].strip() if lines else ""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
 def oiio_error(source: "oiio.ImageInput | oiio.ImageOutput | None" = None) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_ir.files import special_kind
 from warp_ir.image.color_space import COLOR_SPACES, REC709, from_rec709, matrix
 from warp_ir.scene import InputError
 
@@ -226,4 +227,6 @@ def _buffer(colors: Array) -> Any:
 
 @functools.lru_cache(maxsize=4)
 def _load(path: str) -> OcioConfig:
+    if other := special_kind(path):
+        raise InputError(f"OpenColorIO: {path}: is {other}, not a configuration")
     return OcioConfig(path)

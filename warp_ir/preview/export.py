@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_ir.image.io import check_output, whole_file
+from warp_ir.files import check_output, whole_file
 from warp_ir.preview.plot import add_vpls, plotter, select
 from warp_ir.scene import InputError, Scene
 

@@ -3,7 +3,7 @@
 import math
 import weakref
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,9 @@ from warp_ir.reconstruction.reprojection import (
     new_shutter_data,
 )
 from warp_ir.reconstruction.sample_buffer import accumulate, estimate_means, new_sample_buffer, sample_sums
+
+if TYPE_CHECKING:
+    from typing import Self  # Python 3.11
 
 _FILTER_ADDITIONS = 10.0
 """Approximate cost of the filter, in samples added to the film for each pixel: both stream through memory."""
@@ -85,7 +88,7 @@ class Reconstruction:
         """Sums over the samples, by name: they are added when films merge, and restored when a film is resumed."""
         return sample_sums(self._samples)
 
-    def merge(self, other: Self) -> None:
+    def merge(self, other: "Self") -> None:
         """Adds the samples of another film's reconstruction."""
         for mine, theirs in zip(self.arrays().values(), other.arrays().values(), strict=True):
             mine.assign(mine.numpy() + theirs.numpy())

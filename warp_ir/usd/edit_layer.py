@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender, UsdShade, Vt
 
-from warp_ir.image.io import whole_file
+from warp_ir.files import whole_file
 from warp_ir.scene import Camera, Color, Floats, Projection
 from warp_ir.usd.camera_prim import find_camera
 from warp_ir.usd.stage.open import quiet_diagnostics, time_code

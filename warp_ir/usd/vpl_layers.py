@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, Vt
 
-from warp_ir.image.io import whole_file
+from warp_ir.files import whole_file
 from warp_ir.scene import Scene
 
 _LIGHT_RADIUS = 1e-3

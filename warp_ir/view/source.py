@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from warp_ir.image.io import check_output
+from warp_ir.files import check_output
 from warp_ir.scene import Camera, InputError, Scene
 from warp_ir.usd import StageReader
 from warp_ir.usd.edit_layer import write_edits

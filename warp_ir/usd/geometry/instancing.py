@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
+from warp_ir.memory import require_memory
 from warp_ir.scene import Bools, Floats, Ints
 from warp_ir.usd.geometry.velocities import Motion, motion_after_sample
 from warp_ir.usd.values import read
 from warp_ir.usd.values.report import Report, Unreadable
+
+_BYTES_PER_INSTANCE = 450
+"""Memory in which an instance is read, at the peak: measured for ten million."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,7 @@ class InstanceLevel:
 
     def world_matrices(self) -> Floats:
         """world_from_level of every instance, float64 [instance_count, 4, 4]."""
+        require_memory(_BYTES_PER_INSTANCE * self.instance_count, f"{self.instance_count} nested instances")
         return nested_transforms(level.matrices for level in self.chain())
 
 
@@ -160,6 +165,7 @@ def read_instancer(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> list[P
     if indices is None or len(indices) == 0:
         return []
     count = len(indices)
+    require_memory(_BYTES_PER_INSTANCE * count, f"{prim.GetPath()}: {count} instances")
     matrices, sampled = _instance_matrices(instancer, count, time, report)
     visible = _visible_mask(instancer, count, time, report)
     finite = np.isfinite(matrices).all(axis=(1, 2))

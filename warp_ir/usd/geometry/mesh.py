@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from warp_ir.memory import require_memory
 from warp_ir.scene import Bools, Floats, Ints
 from warp_ir.usd.geometry.refine import Scheme
 from warp_ir.usd.geometry.skinning import DeformedMesh, Skinning
@@ -14,6 +15,9 @@ from warp_ir.usd.geometry.velocities import motion_after_sample
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import Cells, TriangleMesh, count_elements, drop_degenerate, with_normals
+
+_BYTES_PER_CORNER = 100
+"""Memory in which a corner of a face is read, at the peak: measured for ten million triangles."""
 
 
 def read_mesh(
@@ -38,6 +42,7 @@ def read_mesh(
     indices = read.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
         return None
+    require_memory(_BYTES_PER_CORNER * len(indices), f"{prim.GetPath()}: {len(counts)} faces")
     _check_topology(points, counts, indices)
     deformed = None if skinning is None else skinning.deform(prim, points)
     if deformed is not None:

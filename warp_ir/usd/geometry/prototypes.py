@@ -9,13 +9,13 @@ nested instances are flattened if their triangles, of `_TRIANGLE_BYTES` each, ta
 
 import hashlib
 import math
-import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_ir.memory import require_memory
 from warp_ir.scene import Bools, Floats, InputError, Instances, Mesh
 from warp_ir.scene.instances import cofactors
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
@@ -132,12 +132,7 @@ def choose_storage(gprims: Sequence[InstancedGprim], source: str, times: int = 1
     if triangles > _MAX_TRIANGLES:
         raise InputError(f"{source}: {triangles} triangles after instancing: too many to load")
     count = sum(instances.values())
-    needed, available = _INSTANCE_BYTES * count, _physical_memory()
-    if needed > available:
-        raise InputError(
-            f"{source}: {count} instances are too many: they need about {needed / 2**30:.0f} GiB of memory, the machine"
-            f" has {available / 2**30:.0f} GiB"
-        )
+    require_memory(_INSTANCE_BYTES * count, f"{source}: {count} instances are too many: they")
     return meshes
 
 
@@ -285,11 +280,3 @@ def well_conditioned(matrices: Floats) -> Bools:
         determinant = np.sum(linear[:, 0] * cofactor[:, 0], axis=1)
         condition = np.abs(linear).max(axis=(1, 2)) * np.abs(cofactor).max(axis=(1, 2)) / np.abs(determinant)
         return np.asarray(condition < _MAX_CONDITION)
-
-
-def _physical_memory() -> float:
-    """Memory of this machine in bytes; infinity if unknown."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
-        return float("inf")

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Ar, Sdf
 
-from warp_ir.image.io import first_line, oiio_error
+from warp_ir.files import first_line
+from warp_ir.image.io import oiio_error
 from warp_ir.scene import Floats
 from warp_ir.usd.values import source_color_space
 from warp_ir.usd.values.report import Unreadable

@@ -24,12 +24,22 @@ _MAX_VALUES_PER_BYTE = 2048
 """Maximum number of values per compressed byte: LZ4 packs 255 bytes into one, integer coding 4 values into each."""
 
 
+MAX_DEPTH = 10_000
+"""How deeply prims may be nested: USD, whose reader calls itself, ends the process at some tens of thousands."""
+
+
+def is_crate(path: str) -> bool:
+    """Whether a file is a crate file."""
+    with open(path, "rb") as file:
+        return file.read(8) == _MAGIC
+
+
 def validate_crate(path: str) -> None:
     """Check the tables of a crate file, or of those in a .usdz package; other files are left to USD.
 
     Raises:
-        InputError: A table is larger than its data can be, the paths are no tree, or the checksum of a package does
-            not fit its data.
+        InputError: A table is larger than its data can be, the paths are no tree or too deep a tree, or the checksum
+            of a package does not fit its data.
     """
     for name, data in _crate_files(path):
         try:
@@ -109,7 +119,7 @@ def _fits(name: str, table: memoryview) -> bool:
 
 
 def _is_tree(table: memoryview) -> bool:
-    """Whether the compressed nodes of a table PATHS are one tree.
+    """Whether the compressed nodes of a table PATHS are one tree, which is not too deep.
 
     Node i has a jump: -2 without child and sibling, -1 for a child i + 1 alone, 0 for a sibling i + 1 alone, and j > 0
     for a child i + 1 and a sibling i + j. The nodes are a tree if each but the first is reached exactly once.
@@ -125,7 +135,24 @@ def _is_tree(table: memoryview) -> bool:
         return False
     nodes = np.arange(count)
     reached = np.concatenate([nodes[jumps >= -1] + 1, nodes[jumps > 0] + jumps[jumps > 0]])
-    return bool(np.array_equal(np.sort(reached), nodes[1:]))
+    return bool(np.array_equal(np.sort(reached), nodes[1:])) and _depth(jumps) <= MAX_DEPTH
+
+
+def _depth(jumps: np.ndarray) -> int:
+    """How deep a tree is whose nodes have these jumps; at most: `MAX_DEPTH` or less if it has so few parents."""
+    parents = int(np.count_nonzero((jumps == -1) | (jumps > 0)))
+    if parents <= MAX_DEPTH:
+        return parents
+    depth = deepest = 0
+    siblings: dict[int, int] = {}  # node -> its depth
+    for node, jump in enumerate(jumps.tolist()):
+        depth = siblings.pop(node, depth)
+        if jump > 0:
+            siblings[node + jump] = depth
+        if jump == -1 or jump > 0:
+            depth += 1
+            deepest = max(deepest, depth)
+    return deepest
 
 
 def _integers(packed: memoryview, count: int) -> np.ndarray | None:

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
-from warp_ir.image.io import check_input
+from warp_ir.files import check_input
 from warp_ir.scene import InputError
 from warp_ir.usd.stage.crate_validation import validate_crate
+from warp_ir.usd.stage.layers_check import check_layers
 from warp_ir.usd.stage.mtlx_layers import layers_with_mtlx
 from warp_ir.usd.values.report import Report
 
@@ -55,7 +56,7 @@ def open_stage(
         # IsAbsoluteRootOrPrimPath is true for relative prim paths as well.
         if not (path_of_mask.IsAbsolutePath() and path_of_mask.IsAbsoluteRootOrPrimPath()):
             raise InputError(f"mask: {text!r} is not the absolute path of a prim")
-    root = _open_layer(path)
+    root = _open_layer(path, follow=not mask)
     # An own session layer: variant selections must not change layers that another stage shares.
     session = Sdf.Layer.CreateAnonymous("session")
     if session_layer is not None:
@@ -148,15 +149,16 @@ def _compose(root: Sdf.Layer, session: Sdf.Layer, mask: Sequence[str]) -> Usd.St
     return stage
 
 
-def _open_layer(path: str) -> Sdf.Layer:
-    """Opens a layer.
+def _open_layer(path: str, *, follow: bool = True) -> Sdf.Layer:
+    """Opens a layer, after a look at it and, with `follow`, at all that it refers to.
 
     Raises:
-        InputError: There is no such file, or it is not readable as USD.
+        InputError: There is no such file, or it or one of the others is not readable as USD.
     """
     check_input(path, "a USD file")
     try:
         validate_crate(path)
+        check_layers(path, follow=follow)
         layer = Sdf.Layer.FindOrOpen(path)
     except (Tf.ErrorException, RuntimeError, OSError) as error:
         raise _open_error(path, error) from None
