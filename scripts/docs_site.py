@@ -24,6 +24,7 @@ FROM_OUTSIDE = {
     "tests.md": "tests/README.md",
     "benchmarks.md": "benchmarks/README.md",
     "scenes.md": "scenes_usd/README.md",
+    "examples.md": "examples/README.md",
 }
 """Page of the site, and the file of the repository that it shows."""
 _LINK = re.compile(r"(!?)\[([^\]\[]*)\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")

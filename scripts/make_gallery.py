@@ -8,6 +8,7 @@ The second command makes only the pictures whose name contains the text. All tak
 
 import argparse
 import math
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -232,6 +233,20 @@ def make_error(gallery: Gallery, path: Path) -> None:
     pyplot.close(figure)
 
 
+def make_simulation(gallery: Gallery, path: Path) -> None:
+    """Bodies that fall, by Newton's sensor and with bounced light: the example, which needs the extra `newton`."""
+    from warp_ir.image.io import read_image
+
+    example = Path(__file__).parent.parent / "examples" / "falling_bodies.py"
+    with TemporaryDirectory() as folder:
+        size, frames = str(max(32, round(320 * gallery.quality))), "5"
+        command = [sys.executable, str(example), "--out", folder, "--size", size, "--frames", frames]
+        subprocess.run([*command, "--device", gallery.device], check=True)
+        last = read_image(Path(folder) / "falling_004.png")  # display values
+    half = last.shape[1] // 2
+    write_panels(path, [[("Newton's sensor", last[:, :half]), ("with global illumination", last[:, half:])]])
+
+
 PICTURES: dict[str, Callable[[Gallery, Path], None]] = {
     "cornell_box.png": render("cornell_box", 256, visible_lights=True),
     "crowded_room.jpg": render("crowded_room", 48),
@@ -246,6 +261,7 @@ PICTURES: dict[str, Callable[[Gallery, Path], None]] = {
     "clouds.webp": make_clouds,
     "aovs.webp": make_aovs,
     "error.webp": make_error,
+    "simulation.webp": make_simulation,
 }
 """File name, and what writes the file."""
 

@@ -180,7 +180,7 @@ def build_instance_tree(
     boxes = wp.Bvh(*corners, constructor="sah", leaf_size=1)
     out.instances = launcher.array(instances, Instance)
     if launcher.device.is_cuda:
-        out.bvh, out.bvh_roots = boxes.id, wp.vec2i(-1, NO_TREE)
+        out.bvh, out.root, out.shared_root = boxes.id, -1, NO_TREE
         out.nodes, out.children = launcher.zeros(1, vec8), launcher.zeros(1, vec8i)
         out.leaf_instances, out.continues = launcher.zeros(1, wp.int32), launcher.zeros(1, wp.int32)
         return out, boxes

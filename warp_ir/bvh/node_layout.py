@@ -12,7 +12,7 @@ BVH_WIDTH = wp.constant(8)
 """Children of a node, and triangles of a block: one vector register of float32."""
 INFINITY = wp.constant(3.0e38)
 NO_TREE = wp.constant(-2)
-"""Value of `InstanceTree.bvh_roots`: there is no tree."""
+"""Value of `InstanceTree.root` and `shared_root` on CUDA: there is no tree."""
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
@@ -58,8 +58,8 @@ class InstanceTree:
     """A BVH over the boxes of instances. CUDA reads `bvh`, the CPU the tables. Several trees may share them."""
 
     bvh: wp.uint64  # id of the `wp.Bvh`
-    bvh_roots: wp.vec2i  # its nodes at which rays start: -1 is the whole of it, NO_TREE is none
-    root: int  # the node of the tables at which rays start
+    root: int  # the node at which rays start, of the tables or of `bvh`: there -1 is the whole of it, NO_TREE is none
+    shared_root: int  # of `bvh` alone: a second one, of what several trees share
     nodes: wp.array[vec8]  # as in `Bvh`
     children: wp.array[vec8i]  # per node: a node, or ~row of leaf_instances
     leaf_instances: wp.array[wp.int32]  # instances in the order of the leaves

@@ -166,8 +166,9 @@ def intersect_instances(
     if on_cuda():
         roots = int(2)  # not a constant: the loop would be unrolled
         for k in range(roots):
-            if tree.bvh_roots[k] != NO_TREE:
-                query = wp.bvh_query_ray(tree.bvh, origin, direction, tree.bvh_roots[k])
+            root = wp.where(k == 0, tree.root, tree.shared_root)
+            if root != NO_TREE:
+                query = wp.bvh_query_ray(tree.bvh, origin, direction, root)
                 while wp.bvh_query_next(query, number, hit.t):
                     instance = tree.instances[number]
                     local = _local_ray(instance, origin, direction)

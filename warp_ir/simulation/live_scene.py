@@ -532,7 +532,7 @@ class LiveScene:
         for name in ("nodes", "children", "leaf_instances", "continues"):
             setattr(tree, name, getattr(self._top.tree, name))
         tree.instances = self._boxes.instances
-        tree.bvh, tree.bvh_roots = wp.uint64(0), wp.vec2i(NO_TREE, NO_TREE)
+        tree.bvh, tree.shared_root = wp.uint64(0), NO_TREE
         row = TwoLevel()
         row.bvh, row.tree = self.data.bvh, tree
         rows = record_rows(lambda _: row, count, TwoLevel, launcher)
@@ -543,7 +543,7 @@ class LiveScene:
             found = roots.numpy()
             found[found < 0] = NO_TREE
             rows["tree"]["bvh"] = self._box_tree.id
-            rows["tree"]["bvh_roots"] = np.stack([found[:-1], np.full(count, found[-1])], axis=1)
+            rows["tree"]["root"], rows["tree"]["shared_root"] = found[:-1], found[-1]
         return launcher.array(rows, TwoLevel)
 
 
