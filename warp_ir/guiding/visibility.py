@@ -83,14 +83,15 @@ def _probed_slot(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) ->
     for k in range(first, end):
         if begin + k < group.count:
             weight = slot_weight(group, begin + k, x)
-            total += weight
-            # One pass: each takes the place of those before it with the probability that its weight asks for.
-            u = u * total
-            if u < weight:
-                slot = begin + k
-                u = u / wp.max(weight, 1.0e-30)
-            else:
-                u = (u - weight) / wp.max(total - weight, 1.0e-30)
+            if weight > 0.0:
+                total += weight
+                # One pass: each takes the place of those before it with the probability that its weight asks for.
+                u = u * total
+                if u < weight:
+                    slot = begin + k
+                    u = u / weight
+                else:
+                    u = (u - weight) / (total - weight)
     return wp.vec2(float(slot), total)
 
 
@@ -182,7 +183,9 @@ def _learn_kind(probed: ProbedTiles, kind: int, column: int, row: int, factors: 
     for cell in range(_CELLS):
         share = (arrived[cell] + _PRIOR * mean) / (sent[cell] + _PRIOR)
         factors[to + cell % CELLS_OF_LANE * _LANES + cell // CELLS_OF_LANE] = wp.sqrt(share)
-    visible = light[1] / wp.max(light[0], 1.0e-30)
+    visible = float(0.0)
+    if light[0] > 0.0:
+        visible = light[1] / light[0]
     return light[0] * wp.sqrt(visible * (1.0 - visible) + _OTHER_VARIANCE * visible)
 
 
@@ -194,7 +197,9 @@ def _learn_tiles(first: int, probed: ProbedTiles, learned: TileVisibility) -> No
     row = learned.first_row - probed.tiles.first_row + i // learned.columns
     to_lights = _learn_kind(probed, 0, column, row, learned.to_lights, _CELLS * i)
     to_surfaces = _learn_kind(probed, 1, column, row, learned.to_surfaces, _CELLS * i)
-    share = to_lights / wp.max(to_lights + to_surfaces, 1.0e-30)
+    share = float(0.5)
+    if to_lights + to_surfaces > 0.0:
+        share = to_lights / (to_lights + to_surfaces)
     rays = wp.clamp(int(wp.round(share * float(_RAYS))), 1, _RAYS - 1)
     learned.rays[i] = wp.vec2i(rays, _RAYS - rays)
 
