@@ -3,6 +3,8 @@
 import itertools
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -172,12 +174,30 @@ def test_a_part_goes_on_where_it_was_stopped(tmp_path, capsys, caplog):
             np.testing.assert_array_equal(file[name], before[films[1]][name])
     assert main([*words, "--part", "2/2", "--resume"]) == 0 and "exists and is skipped" in caplog.text
     capsys.readouterr()
-    for more in (["--part", "1/2"], ["--part", "2/2", "--iterations", "8"], ["--resume"]):
+    for more in (["--part", "1/2"], ["--part", "2/2", "--iterations", "8"], ["--resume"], []):
         assert main([*words, *more]) == 2
         assert "2.npy.film.npz: holds part 2/2 of 7 iterations" in capsys.readouterr().err
+    # A picture may take the name that a part was given: its film stays.
+    assert merge(films, tmp_path / "a" / "2.npy") == 0 and all(path.exists() for path in films)
     assert merge([film], whole) == 0 and merge(films, tmp_path / "halves.npy") == 0
     one, other = read_image(whole), read_image(tmp_path / "halves.npy")
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * one.mean())
+
+
+@pytest.mark.extended
+def test_a_part_that_is_interrupted_is_saved(tmp_path):
+    """Ctrl-C leaves the iterations that are done in the film, even without checkpoints, and 130."""
+    picture = tmp_path / "a.npy"
+    words = ["render", ROOM, str(picture), *SMALL[:4], "--iterations", "1000000", "--checkpoint", "0", "--part", "2/2"]
+    python = "from warp_ir.cli import render, command; import os, signal, sys\n"
+    python += "class Display(render.ProgressDisplay):\n    def __call__(self, progress):\n"
+    python += "        progress.iterations == 3 and os.kill(os.getpid(), signal.SIGINT)\n"
+    python += "render.ProgressDisplay = Display\ncommand()"
+    done = subprocess.run([sys.executable, "-c", python, *words], capture_output=True, text=True)
+    assert done.returncode == 130 and "--resume continues from this checkpoint" in done.stderr, done.stderr
+    assert os.listdir(tmp_path) == ["a.npy.film.npz"]
+    state = read_state(film_of(picture))
+    assert 3 <= state.iterations < 100 and json.loads(state.note)["part"] == 2
 
 
 @pytest.mark.extended

@@ -267,7 +267,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         product = None if picture.product is None else picture.product.path
         note = "" if part is None else note_of(part, args, picture.time, product)
         checkpoint = Checkpoint(path, film, lambda: fingerprint(scene, renderer.settings), args.checkpoint, note)
-        _check_part(part, checkpoint.path, resume=args.resume)
+        if not job.films:
+            _check_part(part, checkpoint.path, resume=args.resume)
         if args.resume and checkpoint.resume():
             if part is not None and film.iterations >= len(part.iterations):
                 return None
@@ -333,15 +334,20 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         write_warnings = [str(warning.message) for warning in caught]
         timings["write"] = time.perf_counter() - begin
         job.write_seconds = timings["write"]
-    if part is not None and not stop_signal:
+    if job.films:  # they stay as they are, even if one lies where a checkpoint would
+        if failure:
+            say(f"error: {failure}", logging.ERROR)
+    elif failure:
+        _say_saved(checkpoint.keep(), checkpoint, failure)
+    elif part is not None and film.iterations:
         saved = checkpoint.keep()
         if saved != checkpoint.path:
             _say_saved(saved, checkpoint, f"{checkpoint.path}: cannot be written")
-            code = 1
+            code = code or 1
+        elif stop_signal:
+            say(f"{checkpoint.path}: --resume continues from this checkpoint")
         else:
             written = [saved]
-    elif failure:
-        _say_saved(checkpoint.keep(), checkpoint, failure)
     elif not stop_signal:
         checkpoint.remove()
     elif args.checkpoint > 0.0 and checkpoint.write():
@@ -458,13 +464,18 @@ def _is_finished(job: _Job, picture: _Picture, scene: Scene, settings: RenderSet
 
 def _check_part(part: Part | None, film: Path, *, resume: bool) -> None:
     """Raises `InputError` if the film that is there is of another part: one must not take the other's place."""
-    if not film.exists() or (part is None and not resume):
+    if not film.exists():
         return
     from warp_ir.film import read_state
 
-    other = read_part(film).part if read_state(film).note else None
+    try:
+        other = read_part(film).part if read_state(film).note else None
+    except InputError:
+        if resume:
+            raise
+        return  # it is damaged, and replaced
     if other != part:
-        holds = "a whole picture" if other is None else f"{other} of {other.total} iterations"
+        holds = "an unfinished picture" if other is None else f"{other} of {other.total} iterations"
         raise InputError(f"{film}: holds {holds}: name another OUTPUT, or remove it")
 
 
@@ -495,7 +506,7 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     A blank picture says nothing about the light that its samples have missed: it has no estimated error.
     """
     if film.interrupted:
-        message = "interrupted" if written else "interrupted before the first iteration: nothing written"
+        message = "interrupted" if film.iterations else "interrupted before the first iteration: nothing written"
         say(message, logging.ERROR)
     if not written:
         return
