@@ -14,7 +14,7 @@ take PTX for compute_75, which the driver then compiles.
 
 import argparse
 import gc
-import importlib
+import importlib.util
 import json
 import os
 import subprocess
@@ -375,6 +375,8 @@ def compile_for(arch: int) -> int:
     from warp_ir.device.launcher import _BLOCK_DIM
 
     files = [path for path in (ROOT / "warp_ir").rglob("*.py") if "@wp.kernel" in path.read_text()]
+    if importlib.util.find_spec("newton") is None:
+        files = [path for path in files if path.parent.name != "newton"]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sorted(files)]
     for name in [*names, "rays"]:
         importlib.import_module(name)

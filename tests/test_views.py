@@ -295,3 +295,11 @@ def test_arrays_of_another_shape_are_refused(pair):
     for name, bad in (("color", wp.zeros((1, 4, 5), dtype=wp.uint32)), ("depth", wp.zeros((1, 4, 4), dtype=wp.uint32))):
         with pytest.raises(InputError, match=name):
             pair[1].render(transforms, bundle, array([0], wp.int32), **{name: bad})
+
+
+def test_images_are_shared_without_a_copy(pair):
+    """An output may be memory of another library, by DLPack."""
+    theirs = np.zeros((1, 4, 4), np.float32)
+    ours = wp.from_dlpack(theirs)
+    shots(pair[1], [EYE], rays(4), [0], into={"depth": ours})
+    assert theirs.max() > 1.0 and (ours.numpy() == theirs).all()
