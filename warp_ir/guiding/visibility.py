@@ -20,7 +20,7 @@ from warp_ir.tiles import TILE
 from warp_ir.vpl.gather import slot_weight
 from warp_ir.vpl.guide import Guide
 from warp_ir.vpl.sets import VplSets
-from warp_ir.vpl.visibility import CELLS, CELLS_OF_LANE, TileVisibility, nothing_learned
+from warp_ir.vpl.visibility import CELLS, CELLS_OF_LANE, TileVisibility, nothing_learned, section_begin
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -66,21 +66,24 @@ class ProbedTiles:
     light: wp.array[wp.vec2]  # [tiles, 2], sum of the light of all sections, and of those where the ray arrived
 
 
-@wp.func
-def _probed_slot(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) -> wp.vec2:
-    """A VPL of a section of a random set, drawn by its contribution: its slot, and the contribution of the section.
+@wp.struct
+class DrawnVpl:
+    """A VPL of a section."""
 
-    The slot is -1 if none of them contributes.
-    """
+    slot: int  # -1: none of the section contributes
+    light: float  # contribution of the section
+
+
+@wp.func
+def _draw_vpl(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) -> DrawnVpl:
+    """Draws a VPL of a section of a random set by its contribution."""
     begin = int(sobol.hash_combine(seed, wp.uint32(0)) % wp.uint32(group.sets)) * group.blocks * _LANES
     begin += cell // CELLS_OF_LANE * group.blocks
     section = cell % CELLS_OF_LANE
-    first = (section * group.blocks + CELLS_OF_LANE - 1) // CELLS_OF_LANE
-    end = ((section + 1) * group.blocks + CELLS_OF_LANE - 1) // CELLS_OF_LANE
     u = sobol.to_unit(sobol.hash_combine(seed, wp.uint32(1)))
     total = float(0.0)
     slot = int(-1)
-    for k in range(first, end):
+    for k in range(section_begin(section, group.blocks), section_begin(section + 1, group.blocks)):
         if begin + k < group.count:
             weight = slot_weight(group, begin + k, x)
             if weight > 0.0:
@@ -92,7 +95,10 @@ def _probed_slot(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) ->
                     u = u / weight
                 else:
                     u = (u - weight) / (total - weight)
-    return wp.vec2(float(slot), total)
+    out = DrawnVpl()
+    out.slot = slot
+    out.light = total
+    return out
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
@@ -128,13 +134,13 @@ def _probe_tiles(
                 group = vpl_sets[kind]
                 if group.count > 0:
                     ray_seed = sobol.hash_combine(seed, wp.uint32(2 * cell + kind))
-                    slot = _probed_slot(group, cell, x, ray_seed)
-                    if slot[0] >= 0.0:
+                    drawn = _draw_vpl(group, cell, x, ray_seed)
+                    if drawn.slot >= 0:
                         bit = wp.uint64(1) << wp.uint64(cell)
-                        light = slot[1] * float(group.sets)
+                        light = drawn.light * float(group.sets)
                         probed.sent[2 * i + kind] = probed.sent[2 * i + kind] | bit
                         seen = float(0.0)
-                        if _is_visible(scene, group, x, int(slot[0])):
+                        if _is_visible(scene, group, x, drawn.slot):
                             probed.arrived[2 * i + kind] = probed.arrived[2 * i + kind] | bit
                             seen = light
                         probed.light[2 * i + kind] = probed.light[2 * i + kind] + wp.vec2(light, seen)
