@@ -37,7 +37,7 @@ from warp_ir.vpl.visibility import TileVisibility, tile_of
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 MAX_WAVE = 2**20
-"""Largest number of pixels of a wave: several times what a GPU runs at once. A wave takes some 90 bytes a pixel."""
+"""Largest number of pixels of a wave: several times what a GPU runs at once. A wave takes some 120 bytes a pixel."""
 _GATHER_STREAM = wp.constant(wp.uint32(0x5BD1E995))  # decorrelates gathering from the light paths
 _KEY_BITS = MAX_SETS.bit_length()
 _REFLECTS_NOTHING = wp.constant(MAX_SETS)
