@@ -32,7 +32,7 @@ _MOST_LOCAL = 128  # an array of a few boxes, which a loop indexes
 # `path` has 2232: six copies of the tables of distributions, which functions take by value (168 bytes; three
 # in the kernel, three in `_sample_light`), 256 in smaller arrays, and the registers that four calls, one in the other,
 # keep. One of these calls is that of the light paths of spots: without it `path` has 1816.
-# Light paths have the most, 2312: the root of a world's tree and the tint of textures are 16 of these.
+# Light paths have the most, 2312.
 _MOST_LOCAL_OF_RAYS = 2320
 # Light paths of many worlds have copies of their world's settings and buffers in addition.
 _MOST_LOCAL_OF_WORLDS = 3328
