@@ -30,10 +30,11 @@ wp.set_module_options({"enable_backward": False})
 _REGISTERS, _FRAME = 0x2F, 0x11  # EIATTR_REGCOUNT, EIATTR_FRAME_SIZE
 _MOST_REGISTERS = 128  # let a multiprocessor hold 512 threads
 _MOST_LOCAL = 128  # an array of a few boxes, which a loop indexes
-# `path` has the most, 2232: six copies of the tables of distributions, which functions take by value (168 bytes; three
+# `path` has 2232: six copies of the tables of distributions, which functions take by value (168 bytes; three
 # in the kernel, three in `_sample_light`), 256 in smaller arrays, and the registers that four calls, one in the other,
 # keep. One of these calls is that of the light paths of spots: without it `path` has 1816.
-_MOST_LOCAL_OF_RAYS = 2304
+# Light paths have the most, 2312.
+_MOST_LOCAL_OF_RAYS = 2320
 # Light paths of many worlds have copies of their world's settings and buffers in addition.
 _MOST_LOCAL_OF_WORLDS = 3328
 PACKAGE = Path(ir.__file__).parent
