@@ -12,7 +12,16 @@ from warp_ir.device_scene import CameraData, DeviceScene, SceneData
 from warp_ir.lights import emission_to_camera, intersect_lights
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_disk
-from warp_ir.surface import Hit, ShadingPoint, albedo, closest, mapped_normal, shading_normal, smooth_height
+from warp_ir.surface import (
+    Hit,
+    ShadingPoint,
+    albedo,
+    closest,
+    mapped_normal,
+    shading_normal,
+    shading_point,
+    smooth_height,
+)
 from warp_ir.tiles import Tiles, all_tiles, indices, pixel_at, skipped_iterations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -283,19 +292,14 @@ def camera_vertex(gbuffer: GBuffer, pixel: int) -> ShadingPoint:
 
 
 @wp.func
-def vertex_of_hit(scene: SceneData, hit: CameraHit) -> ShadingPoint:
-    """The `camera_vertex` of a camera ray's hit."""
-    x = ShadingPoint()
-    x.position = hit.position
-    x.geometric_normal = hit.normal
-    x.normal = hit.normal
-    x.smooth_height = hit.smooth_height
-    if hit.smooth_height > 0.0:
-        x.normal = hit.smooth_normal
-    x.shading_normal = hit.shading_normal
-    x.mesh = hit.mesh
+def vertex_of_hit(scene: SceneData, hit: Hit) -> ShadingPoint:
+    """The `camera_vertex` of a camera ray's hit, without normal maps."""
+    x = shading_point(scene, hit)
+    x.shading_normal = shading_normal(scene, hit)
+    x.smooth_height = smooth_height(scene, hit, x.shading_normal)
+    if x.smooth_height > 0.0:
+        x.normal = x.shading_normal
     x.from_camera = True
-    x.tile = -1
     return x
 
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_ir.device.launcher import MAX_REGISTERS, Launcher, copy_record
 from warp_ir.device_scene import CameraData, SceneData
-from warp_ir.gbuffer import camera_ray, trace_camera_ray, vertex_of_hit
+from warp_ir.gbuffer import camera_ray, first_hit, vertex_of_hit
 from warp_ir.lights import light_visibility
 from warp_ir.sampling import sobol
 from warp_ir.surface import ShadingPoint
@@ -101,7 +101,7 @@ def _draw_vpl(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) -> Dr
     return out
 
 
-@wp.kernel(cuda_max_registers=MAX_REGISTERS)
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _probe_tiles(
     first: int,
     scene: SceneData,
@@ -123,8 +123,8 @@ def _probe_tiles(
         column = wp.min(TILE * tile_column + 2 * (point % 4), camera.columns - 1)
         row = wp.min(TILE * tile_row + 2 * (point // 4), camera.rows - 1)
         ray = camera_ray(camera, row * camera.columns + column, wp.vec2(0.5, 0.5), wp.vec2(0.0, 0.0))
-        hit = trace_camera_ray(scene, camera, ray)
-        if hit.mesh >= 0:
+        hit = first_hit(scene, camera, ray)
+        if hit.triangle >= 0:
             x = vertex_of_hit(scene, hit)
             for ray_of_point in range(2 * _CELLS // _POINTS):
                 kind = ray_of_point % 2
@@ -195,7 +195,7 @@ def _learn_kind(probed: ProbedTiles, kind: int, column: int, row: int, factors: 
     return light[0] * wp.sqrt(visible * (1.0 - visible) + _OTHER_VARIANCE * visible)
 
 
-@wp.kernel
+@wp.kernel(module="warp_ir.vpl.emission")
 def _learn_tiles(first: int, probed: ProbedTiles, learned: TileVisibility) -> None:
     """Learns from the rays of a tile and of those around it."""
     i = first + wp.tid()
@@ -233,7 +233,6 @@ def learn_visibility(
     """
     whole, learned, probed = copy_record(camera), guide.visibility, ProbedTiles()
     whole.columns, whole.rows, whole.first_column, whole.first_row = camera.image_columns, camera.image_rows, 0, 0
-    whole.visible_lights = 0
     tiles = TileRange()
     tiles.first_column, tiles.columns = _widened(learned.first_column, learned.columns, camera.image_columns)
     tiles.first_row, tiles.rows = _widened(learned.first_row, learned.rows, camera.image_rows)
