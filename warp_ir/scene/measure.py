@@ -63,7 +63,9 @@ def world_bounds(mesh: Mesh, group: Instances | None) -> tuple[Floats, Floats]:
     """Lower and upper corner [3] of the world-space box around the triangles of a mesh, or around all of its copies."""
     cache = _BOXES.setdefault(group or mesh, WeakKeyDictionary())
     if mesh not in cache:
-        used = mesh.points[np.unique(mesh.triangles)]
+        is_used = np.zeros(len(mesh.points), dtype=bool)
+        is_used[mesh.triangles] = True
+        used = mesh.points if is_used.all() else mesh.points[is_used]
         if group is None:
             cache[mesh] = (used.min(axis=0), used.max(axis=0))
         else:

@@ -8,9 +8,12 @@ from pxr import Sdf, Usd, UsdLux
 
 from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
+from warp_ir.usd.geometry.curves import CURVES, read_curves
+from warp_ir.usd.geometry.detail import PixelSize
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 from warp_ir.usd.geometry.mesh import read_mesh, read_tet_mesh
+from warp_ir.usd.geometry.patch import read_patch
 from warp_ir.usd.geometry.prototypes import (
     MAX_FLATTENED_TRIANGLES,
     InstancedGprim,
@@ -20,6 +23,7 @@ from warp_ir.usd.geometry.prototypes import (
     well_conditioned,
 )
 from warp_ir.usd.geometry.skinning import Skinning, pose_key
+from warp_ir.usd.geometry.spheres import read_spheres
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue
@@ -35,6 +39,9 @@ from warp_ir.usd.values.triangles import TriangleMesh, cross_products, drop_dege
 
 ShapeCache = dict[tuple[Sdf.Path, ...], TriangleMesh | None]
 """Shapes by prim and skinning; None: the prim cannot be read or has no triangles."""
+
+_DETAILED = (*CURVES, "NurbsPatch", "Points")
+"""Schemas whose shapes depend on how large they are in the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,7 @@ def build_meshes(
     purposes: Sequence[str] = PURPOSES[:2],
     links: LightLinks | None = None,
     times: int = 1,
+    pixel: PixelSize | None = None,
 ) -> Geometry:
     """Meshes of gprims (one per gprim, with all its copies), instanced prototypes, and the materials that they use.
 
@@ -92,13 +100,15 @@ def build_meshes(
         purposes: Purposes of material bindings, in order of preference.
         links: Light links, by which copies of a gprim may differ.
         times: Number of shutter samples for which the gprims are read.
+        pixel: The size of a pixel of the picture; None: not known.
 
     Raises:
         InputError: There are more triangles than can be rendered.
     """
     table = MaterialTable(time, report, images, metals, purposes)
     shape_cache = {} if shapes is None else shapes
-    return _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(())).run(gprims, times)
+    builder = _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(()), pixel)
+    return builder.run(gprims, times)
 
 
 class _MeshBuilder:
@@ -112,9 +122,11 @@ class _MeshBuilder:
         table: MaterialTable,
         shapes: ShapeCache,
         links: LightLinks,
+        pixel: PixelSize | None,
     ) -> None:
         self._time, self._report, self._levels, self._table = time, report, levels, table
-        self._links = links
+        self._links, self._pixel = links, pixel
+        self._places: dict[Sdf.Path, list[Floats]] = {}
         self._skinning = Skinning(time, report)
         self._shapes = shapes
         self._gprim_cache: dict[tuple[object, ...], tuple[TriangleMesh, MaterialAssignment, bool]] = {}
@@ -126,6 +138,9 @@ class _MeshBuilder:
     def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
         self._table.resolve([drawn.prim for drawn in drawn_prims])
+        for drawn in drawn_prims:
+            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
+                self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
         meshes: list[Mesh] = []
@@ -303,8 +318,7 @@ class _MeshBuilder:
 
     def _shape(self, prim: Usd.Prim) -> TriangleMesh | None:
         """The prim's triangles in its own space, cached; instances of a native prototype share them."""
-        shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
-        key = (shared, *pose_key(prim))
+        key = (_shared_path(prim), *pose_key(prim))
         if key not in self._shapes:
             try:
                 shape = self._read(prim)
@@ -324,6 +338,13 @@ class _MeshBuilder:
             return read_implicit(prim, schema, self._time)
         if schema == "TetMesh":
             return read_tet_mesh(prim, self._time, self._report)
+        if schema in _DETAILED:
+            places = np.concatenate(self._places[_shared_path(prim)])
+            if schema == "NurbsPatch":
+                return read_patch(prim, self._time, self._report, places, self._pixel)
+            if schema == "Points":
+                return read_spheres(prim, self._time, self._report, places, self._pixel)
+            return read_curves(prim, schema, self._time, self._report, places, self._pixel, self._skinning)
         return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
     def _mesh(
@@ -433,6 +454,11 @@ class _MeshBuilder:
         index = (np.cumsum(used) - 1).astype(np.int32)
         remapped = tuple(replace(mesh, material=index[mesh.material]) for mesh in meshes)
         return remapped, tuple(m for m, is_used in zip(table, used, strict=True) if is_used)
+
+
+def _shared_path(prim: Usd.Prim) -> Sdf.Path:
+    """The path by which a prim's shape is cached: that in the prototype for prims of native instances."""
+    return (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
 
 
 def _fill_with_geometric_normals(normals: Floats, points: Floats, triangles: Ints) -> Floats:

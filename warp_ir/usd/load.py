@@ -14,6 +14,7 @@ from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Scene
 from warp_ir.usd.assemble import Geometry, ShapeCache, build_meshes
 from warp_ir.usd.camera_prim import all_cameras, eye_camera, find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.diagnose import diagnose_black_picture, diagnose_dark_lights
+from warp_ir.usd.geometry.detail import PixelSize, pixel_size
 from warp_ir.usd.geometry.prototypes import reuse_prototypes
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.lights.light import LIGHTS, read_light
@@ -203,6 +204,7 @@ class StageReader:
         self._moving_report = self._open_report.section()
         self._times = 1  # for which moving gprims are read: 1, or the number of shutter samples
         self._moving_triangles = 0  # stored anew at every time
+        self._pixel: PixelSize | None = None  # of the picture; None: not known, or not the same at all times
         self._prototypes: tuple[Mesh, ...] = ()  # of moving instances, at the last time
 
     def spec(self, time: float | str | None = None) -> RenderSpec:
@@ -320,6 +322,13 @@ class StageReader:
     def _scene(self, time: Usd.TimeCode, camera: Usd.Prim | None, spec: RenderSpec, report: Report) -> Scene:
         """The scene at one time, without shutter samples."""
         camera_record = None if camera is None else read_camera(camera, time, report)
+        if self._eye is not None:
+            ahead = (self._eye[0] + 1.0, *self._eye[1:])  # where it looks does not matter
+            self._pixel = pixel_size(eye_camera(self._eye, ahead, self._up_axis))
+        elif camera is not None and camera_record is not None and not self._time_varying.varies(camera):
+            self._pixel = pixel_size(camera_record)
+        else:
+            self._pixel = None
         purposes = tuple(self._purposes or spec.purposes or _DEFAULT_PURPOSES)
         key = _StaticKey(purposes, spec.material_purposes, time.IsDefault())
         self._time_varying.purposes = spec.material_purposes
@@ -385,6 +394,7 @@ class StageReader:
                 metals=self._metals,
                 purposes=key.material_purposes,
                 links=links,
+                pixel=self._pixel,
             )
             lights = _lights(fixed.lights, time, read)
             self._rigid_shapes.clear()
@@ -422,6 +432,7 @@ class StageReader:
                     self._time_varying.purposes,
                     static.links,
                     self._times,
+                    self._pixel,
                 )
                 rigid = set() if deforms else {k for group in added.instances for k in group.meshes}
                 self._moving_triangles += sum(len(m.triangles) for k, m in enumerate(added.meshes) if k not in rigid)

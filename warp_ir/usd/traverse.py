@@ -7,6 +7,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Floats
+from warp_ir.usd.geometry.curves import CURVES
 from warp_ir.usd.geometry.implicit import IMPLICIT
 from warp_ir.usd.geometry.instancing import InstanceLevel, read_instancer
 from warp_ir.usd.lights.light import LIGHTS
@@ -25,7 +26,7 @@ _METADATA_TYPES = ("HoudiniLayerInfo",)
 
 _IDENTITY = Gf.Matrix4d(1.0)
 _WORLD = InstanceLevel(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
-_GPRIM_TYPES = {"Mesh", "TetMesh", *IMPLICIT}
+_GPRIM_TYPES = {"Mesh", "TetMesh", *IMPLICIT, *CURVES, "NurbsPatch", "Points"}
 _DRAWN_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 # A prototype may be defined below an `over` or a `class`, which are not drawn themselves.
 _PROTOTYPE_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)

@@ -335,7 +335,9 @@ def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:
 
 def _element_types(prim: Usd.Prim) -> tuple[str, ...]:
     """The elements of a prim to which materials are bound."""
-    return (UsdGeom.Tokens.face, _TETRAHEDRON) if prim.IsA(UsdGeom.TetMesh) else (UsdGeom.Tokens.face,)
+    if prim.IsA(UsdGeom.TetMesh):
+        return UsdGeom.Tokens.face, _TETRAHEDRON
+    return (UsdGeom.Tokens.point,) if prim.IsA(UsdGeom.Points) else (UsdGeom.Tokens.face,)
 
 
 def _dangling_target(prim: Usd.Prim) -> Sdf.Path | None:
