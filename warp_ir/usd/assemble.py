@@ -61,6 +61,8 @@ class _Gprim:
     shape: TriangleMesh
     assignment: MaterialAssignment
     emits: bool
+    light: bool = False
+    """Whether it is a light (`_mesh_light`)."""
 
 
 @dataclass(eq=False)
@@ -129,6 +131,7 @@ class _MeshBuilder:
         self._places: dict[Sdf.Path, list[Floats]] = {}
         self._skinning = Skinning(time, report)
         self._shapes = shapes
+        self._plain_gprims: dict[tuple[int, Hashable], _Gprim] = {}
         self._gprim_cache: dict[tuple[object, ...], tuple[TriangleMesh, MaterialAssignment, bool]] = {}
         self._placed_cache: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
         self._mesh_lights: dict[Sdf.Path, MeshLightPrim] = {}
@@ -143,10 +146,14 @@ class _MeshBuilder:
                 self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
+        singles = self._single_meshes(gprims)
         meshes: list[Mesh] = []
         prototypes: dict[int, _Prototype] = {}
         for stored in choose_storage(parts, self._report.source, times):
             gprim, group = gprims[stored.gprim], stored.prototype
+            if stored.gprim in singles:
+                meshes.append(singles[stored.gprim])
+                continue
             matrices_in_level = nested_transforms(level.matrices for level in stored.levels)
             colors = nested_colors((len(level.matrices), level.colors) for level in stored.levels)
             if group is None:
@@ -178,6 +185,44 @@ class _MeshBuilder:
         used_meshes, materials = self._without_unused_materials(meshes)
         return Geometry(used_meshes, tuple(instances), materials)
 
+    def _single_meshes(self, gprims: Sequence[_Gprim]) -> dict[int, Mesh]:
+        """Meshes of the gprims that are no lights and in no instance, by index; equal shapes are placed at once."""
+        by_shape: dict[int, list[int]] = {}
+        for k, gprim in enumerate(gprims):
+            if gprim.drawn.level.parent is None and not gprim.light:
+                by_shape.setdefault(id(gprim.shape), []).append(k)
+        meshes: dict[int, Mesh] = {}
+        for indices in by_shape.values():
+            shape = gprims[indices[0]].shape
+            matrices = np.stack([gprims[k].drawn.level_from_prim for k in indices])
+            determinants = np.linalg.det(matrices[:, :3, :3])
+            regular = np.isfinite(matrices).all(axis=(1, 2)) & (determinants > 0.0)
+            chosen = np.flatnonzero(regular)
+            if len(chosen) == 0:
+                continue
+            points, _, normals = instantiate(shape, matrices[chosen])
+            rows = points.reshape(len(chosen), -1, 3)
+            normal_rows = None if normals is None else normals.reshape(len(chosen), -1, 3, 3)
+            for row, k in enumerate(chosen.tolist()):
+                drawn, assignment = gprims[indices[k]].drawn, gprims[indices[k]].assignment
+                own_normals = None if normal_rows is None else normal_rows[row]
+                tangents = None
+                if assignment.uvs:
+                    placed = rows[row], shape.triangles, own_normals
+                    tangents = self._tangents(*placed, assignment.uvs, assignment.material)
+                meshes[indices[k]] = Mesh(
+                    str(drawn.prim.GetPath()),
+                    rows[row],
+                    shape.triangles,
+                    assignment.material,
+                    own_normals,
+                    assignment.colors,
+                    self._double_sided(drawn),
+                    assignment.uvs,
+                    tangents=tangents,
+                )
+        return meshes
+
     @staticmethod
     def _add(meshes: list[Mesh], mesh: Mesh | None) -> list[int]:
         """Appends a mesh unless it is None; returns the list of its index."""
@@ -188,11 +233,17 @@ class _MeshBuilder:
 
     def _gprim(self, drawn: DrawnPrim) -> _Gprim | None:
         """A gprim without its fully transparent triangles; equal shapes with equal materials are stored once."""
-        full = self._shape(drawn.prim)
+        full = self._shape(drawn)
         if full is None:
             return None
-        assignment = self._table.assign(drawn.prim, full)
         mesh_light = self._mesh_light(drawn)
+        plain = (
+            self._table.key(drawn.prim, drawn.authored) if mesh_light is None and drawn.level.parent is None else None
+        )
+        if plain is not None and (id(full), plain) in self._plain_gprims:
+            alike = self._plain_gprims[id(full), plain]
+            return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
+        assignment = self._table.assign(drawn.prim, full)
         if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
             corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
             assignment = (
@@ -212,7 +263,11 @@ class _MeshBuilder:
         if len(shape.triangles) == 0:
             return None
         drawn, assignment = self._with_instance_primvars(drawn, assignment)
-        return _Gprim(drawn, shape, assignment, emits or mesh_light is not None)
+        is_light = mesh_light is not None
+        gprim = _Gprim(drawn, shape, assignment, emits or is_light, is_light)
+        if plain is not None and shape is full:
+            self._plain_gprims[id(full), plain] = gprim
+        return gprim
 
     def _with_instance_primvars(
         self, drawn: DrawnPrim, assignment: MaterialAssignment
@@ -288,6 +343,8 @@ class _MeshBuilder:
 
     def _signature(self, gprim: _Gprim) -> object:
         """Equal for gprims of a prototype that look equal and are lit equally; cached objects are compared by id."""
+        if gprim.drawn.level.parent is None:
+            return None  # the world is no prototype
         links = self._links.memberships(gprim.drawn.prim.GetPath())
         return id(gprim.shape), id(gprim.assignment), digest(gprim.drawn.level_from_prim), links
 
@@ -316,12 +373,13 @@ class _MeshBuilder:
         copy_colors = nested_colors([(len(matrices), outer_colors), (len(matrices_in_level), colors)])
         return self._mesh(gprim, nested_transforms([matrices, matrices_in_level]), copy_colors)
 
-    def _shape(self, prim: Usd.Prim) -> TriangleMesh | None:
+    def _shape(self, drawn: DrawnPrim) -> TriangleMesh | None:
         """The prim's triangles in its own space, cached; instances of a native prototype share them."""
+        prim = drawn.prim
         key = (_shared_path(prim), *pose_key(prim))
         if key not in self._shapes:
             try:
-                shape = self._read(prim)
+                shape = self._read(drawn)
             except Unreadable as trouble:
                 self._report.warn(prim.GetPath(), f"{trouble}; the prim is skipped")
                 shape = None
@@ -331,11 +389,12 @@ class _MeshBuilder:
             self._shapes[key] = shape if shape is not None and len(shape.triangles) else None
         return self._shapes[key]
 
-    def _read(self, prim: Usd.Prim) -> TriangleMesh | None:
+    def _read(self, drawn: DrawnPrim) -> TriangleMesh | None:
         """The shape of a gprim by its schema."""
+        prim = drawn.prim
         schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if schema in IMPLICIT:
-            return read_implicit(prim, schema, self._time)
+            return read_implicit(prim, schema, self._time, drawn.authored)
         if schema == "TetMesh":
             return read_tet_mesh(prim, self._time, self._report)
         if schema in _DETAILED:
@@ -399,14 +458,19 @@ class _MeshBuilder:
             material = np.array([self._table.add(m) for m in light_materials], dtype=np.int32)[material]
             if not any(max(m.albedo) > 0.0 for m in light_materials):
                 colors = None  # a light without material response reflects nothing, whatever its primvars
-        # The schema's fallback applies: of the implicit shapes only Plane is double-sided.
-        double_sided = read.flag(prim.GetAttribute("doubleSided"), self._time)
+        double_sided = self._double_sided(gprim.drawn)
         tangents = self._tangents(points, triangles, normals, uvs, material)
         return Mesh(
             *(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare),
             tangents=tangents,
             light=light,
         )
+
+    def _double_sided(self, drawn: DrawnPrim) -> bool:
+        """Whether an emissive gprim emits on both sides; the schema's fallback is true for Plane alone."""
+        if "doubleSided" in drawn.authored or drawn.prim.GetTypeName() == "Plane":
+            return read.flag(drawn.prim.GetAttribute("doubleSided"), self._time)
+        return False
 
     def _tangents(
         self, points: Floats, triangles: Ints, normals: Floats | None, uvs: Mapping[str, Floats], material: Ints
@@ -451,6 +515,8 @@ class _MeshBuilder:
         self._report.stats["unused_materials"] = int((~used).sum())
         if not used.any():
             return tuple(meshes), (Material(),)
+        if used.all():
+            return tuple(meshes), tuple(table)
         index = (np.cumsum(used) - 1).astype(np.int32)
         remapped = tuple(replace(mesh, material=index[mesh.material]) for mesh in meshes)
         return remapped, tuple(m for m, is_used in zip(table, used, strict=True) if is_used)

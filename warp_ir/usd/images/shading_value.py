@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.image.mipmap import resized
+from warp_ir.image.mipmap import resized, value_range
 from warp_ir.scene import Floats, Wrap
+from warp_ir.scene.types import pixel_mean
 
 
 @dataclass(frozen=True)
@@ -59,17 +60,17 @@ class ShadingValue:
     @cached_property
     def mean(self) -> Floats:
         """Mean over the pixels, float64 [c]."""
-        return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
+        return pixel_mean(self.pixels)
 
     @cached_property
     def lowest(self) -> float:
         """Minimum over the pixels and their channels."""
-        return float(self.pixels.min())
+        return value_range(self.pixels)[0]
 
     @cached_property
     def highest(self) -> float:
         """Maximum over the pixels and their channels."""
-        return float(self.pixels.max())
+        return value_range(self.pixels)[1]
 
     def evaluate(self, primvars: PrimvarValues) -> Floats:
         """The value on a surface with these primvars, [c] or [m, 3, c]."""
