@@ -18,6 +18,7 @@ from warp_ir.usd.geometry.detail import PixelSize, pixel_size
 from warp_ir.usd.geometry.prototypes import reuse_prototypes
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.lights.light import LIGHTS, read_light
+from warp_ir.usd.lights.sky import overcast_sky
 from warp_ir.usd.linking import LightLinks, link_lights
 from warp_ir.usd.settings.render_pass import find_render_pass
 from warp_ir.usd.settings.render_spec import Product, RenderSpec, read_render_spec
@@ -145,7 +146,8 @@ class StageReader:
                 default and render.
             complexity: Refinement of subdivision surfaces: "low" draws their cages, "medium", "high" and "veryhigh"
                 one, two and three levels of refinement.
-            default_light: What to do if nothing emits: "dome" adds a uniform white dome of radiance 1, "none" nothing.
+            default_light: What to do if nothing emits: "dome" adds a uniform white dome of radiance 1, "sky" an
+                overcast sky over grey ground, "none" nothing.
             metals: "diffuse" renders a metal as a diffuse surface of its base colour, "black" without its reflection.
             texture_wrap: Wrap mode of textures for which the file gives none: "black" (the specification's default),
                 "clamp", "repeat" or "mirror".
@@ -168,8 +170,8 @@ class StageReader:
             raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
         if complexity not in _REFINEMENT_LEVELS:
             raise InputError(f"complexity: {complexity!r} is none of {', '.join(_REFINEMENT_LEVELS)}")
-        if default_light not in ("dome", "none"):
-            raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
+        if default_light not in ("dome", "sky", "none"):
+            raise InputError(f"default_light: '{default_light}' is not one of 'dome', 'sky', 'none'")
         if metals not in ("diffuse", "black"):
             raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
         if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
@@ -359,6 +361,10 @@ class StageReader:
                 if meshes:
                     report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
                 lights = (_DEFAULT_DOME,)
+            elif self._default_light == "sky":
+                if meshes:
+                    report.warn("/", "nothing emits light; an overcast sky over grey ground is added")
+                lights = (overcast_sky(self._up_axis),)
         lights, meshes = link_lights(self.stage, lights, meshes, report)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         if self._eye is not None:
