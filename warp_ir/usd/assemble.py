@@ -4,12 +4,13 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pxr import Sdf, Usd, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
 from warp_ir.usd.geometry.curves import CURVES, read_curves
 from warp_ir.usd.geometry.detail import PixelSize
+from warp_ir.usd.geometry.displacement import displaced
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 from warp_ir.usd.geometry.mesh import read_mesh, read_tet_mesh
@@ -26,7 +27,7 @@ from warp_ir.usd.geometry.skinning import Skinning, pose_key
 from warp_ir.usd.geometry.spheres import read_spheres
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue
+from warp_ir.usd.images.shading_value import ShadingValue, look_up
 from warp_ir.usd.lights.mesh_light import LIGHT_UV, MeshLightPrim
 from warp_ir.usd.linking import LightLinks
 from warp_ir.usd.shading.binding import PURPOSES
@@ -107,7 +108,7 @@ def build_meshes(
     Raises:
         InputError: There are more triangles than can be rendered.
     """
-    table = MaterialTable(time, report, images, metals, purposes)
+    table = MaterialTable(time, report, images, metals, purposes, displaces=levels > 0)
     shape_cache = {} if shapes is None else shapes
     builder = _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(()), pixel)
     return builder.run(gprims, times)
@@ -132,6 +133,7 @@ class _MeshBuilder:
         self._skinning = Skinning(time, report)
         self._shapes = shapes
         self._plain_gprims: dict[tuple[int, Hashable], _Gprim] = {}
+        self._displaced_shapes: dict[tuple[object, ...], TriangleMesh] = {}
         self._gprim_cache: dict[tuple[object, ...], tuple[TriangleMesh, MaterialAssignment, bool]] = {}
         self._placed_cache: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
         self._mesh_lights: dict[Sdf.Path, MeshLightPrim] = {}
@@ -244,6 +246,7 @@ class _MeshBuilder:
             alike = self._plain_gprims[id(full), plain]
             return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
         assignment = self._table.assign(drawn.prim, full)
+        full = self._displaced(drawn.prim, full, assignment)
         if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
             corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
             assignment = (
@@ -268,6 +271,29 @@ class _MeshBuilder:
         if plain is not None and shape is full:
             self._plain_gprims[id(full), plain] = gprim
         return gprim
+
+    def _displaced(self, prim: Usd.Prim, shape: TriangleMesh, assignment: MaterialAssignment) -> TriangleMesh:
+        """The shape displaced as its materials say, cached; the same shape if they do not."""
+        used = [k for k in np.unique(assignment.material).tolist() if k in self._table.displacements]
+        if not used:
+            return shape
+        if shape.refiner is None or not prim.IsA(UsdGeom.Mesh):
+            self._report.warn(prim.GetPath(), "only subdivision surfaces are displaced ({n} in all)")
+            return shape
+        key = id(shape), digest(assignment.material), _shared_path(prim)
+        if key not in self._displaced_shapes:
+            amounts = np.zeros(shape.triangles.shape)
+            for k in used:
+                value, chosen = self._table.displacements[k], assignment.material == k
+                if value.primvars:
+                    self._report.warn(self._table.materials[k].name, "displacement by primvars takes its fallback")
+                uvs: Floats | None = np.zeros((*shape.triangles.shape, 2))
+                if value.mapping is not None:
+                    uvs = texture_coordinates(prim, shape, value.mapping.uv, self._time, self._report)
+                if uvs is not None:
+                    amounts[chosen] = look_up(value, uvs[chosen])[..., 0]
+            self._displaced_shapes[key] = displaced(shape, amounts)
+        return self._displaced_shapes[key]
 
     def _with_instance_primvars(
         self, drawn: DrawnPrim, assignment: MaterialAssignment

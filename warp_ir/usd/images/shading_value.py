@@ -154,3 +154,30 @@ def compact(pixels: Floats) -> Floats:
     if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
         return pixels
     return pixels.astype(np.float16)
+
+
+def look_up(value: ShadingValue, uvs: Floats) -> Floats:
+    """The value at texture coordinates [..., 2], bilinearly interpolated, float64 [..., c]."""
+    if value.mapping is None:
+        return np.broadcast_to(value.mean, (*uvs.shape[:-1], len(value.mean)))
+    height, width, _ = value.pixels.shape
+    st = uvs.astype(np.float64) @ np.array(value.mapping.transform)[:, :2].T + np.array(value.mapping.transform)[:, 2]
+    neighbours, outside = [], np.zeros(st.shape[:-1], dtype=bool)
+    for axis, size in ((0, width), (1, height)):
+        x = st[..., axis] if axis == 0 else 1.0 - st[..., axis]
+        wrap = value.mapping.wrap[axis]
+        if wrap == Wrap.MIRROR:
+            x = 1.0 - np.abs(np.mod(x, 2.0) - 1.0)
+        elif wrap == Wrap.BLACK:
+            outside |= (x < 0.0) | (x > 1.0)
+        place = x * size - 0.5
+        low = np.floor(place).astype(np.int64)
+        pair = [low, low + 1]
+        pair = [np.mod(k, size) if wrap == Wrap.REPEAT else k.clip(0, size - 1) for k in pair]
+        neighbours.append((pair, (place - low)[..., None]))
+    (columns, s), (rows, t) = neighbours
+    pixels = value.pixels
+    top, bottom = ((1.0 - s) * pixels[row, columns[0]] + s * pixels[row, columns[1]] for row in rows)
+    out: Floats = (1.0 - t) * top + t * bottom
+    out[outside] = value.outside
+    return out

@@ -10,7 +10,7 @@ from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
-from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_material
+from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh
@@ -66,6 +66,7 @@ class MaterialTable:
         images: Cache of images; None: a new one.
         metals: "diffuse" or "black".
         purposes: Purposes of material bindings, in order of preference.
+        displaces: Whether displacements are read.
     """
 
     def __init__(
@@ -75,7 +76,12 @@ class MaterialTable:
         images: ImageCache | None = None,
         metals: str = "diffuse",
         purposes: Sequence[str] = PURPOSES[:2],
+        *,
+        displaces: bool = False,
     ) -> None:
+        self._displaces = displaces
+        self.displacements: dict[int, ShadingValue] = {}
+        """Displacements of materials by their index."""
         self.materials: list[Material] = []
         self._purposes = purposes
         self._time, self._report = time, report
@@ -395,8 +401,14 @@ class MaterialTable:
         path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
         if path not in self._index_by_path:
             try:
-                evaluated = read_material(material, self._time, self._images, black_metals=self._black_metals)
+                evaluated = read_material(
+                    material, self._time, self._images, black_metals=self._black_metals, displaces=self._displaces
+                )
                 self._index_by_path[path] = TRANSPARENT if evaluated is None else self.add(evaluated.material)
+                if evaluated is not None and self._displaces:
+                    displacement = evaluated.displacement or read_displacement(material, self._time, self._images)
+                    if displacement is not None:
+                        self.displacements[self._index_by_path[path]] = displacement
                 if evaluated is not None and (evaluated.albedo or evaluated.emission or evaluated.opacity):
                     self._primvar_materials[self._index_by_path[path]] = evaluated
             except Unreadable as trouble:
