@@ -400,3 +400,54 @@ def test_hair_takes_three_sides(tmp_path):
     mesh = only_mesh(load_usd(tmp_path / "hair.usdc"))
     assert len(mesh.triangles) == 6 * count * (points - 1)
     assert area(mesh) == pytest.approx(np.pi * 1e-4 * 0.1 * count, rel=1e-4)
+
+
+POINTS = [
+    *("[]", "[(0, 0, 0)]", "[(0, 0, 0), (0, 0, 0)]", "[(0, 0, 0), (1, 0, 0), (2, 1, 0), (3, 0, 1)]"),
+    *("[(nan, 0, 0), (1, 0, 0), (2, inf, 0), (3, 0, 1)]", "[(1e30, 0, 0), (-1e30, 0, 0), (0, 1e30, 1), (0, 0, 0)]"),
+    "[(0, 0, 0), (1, 0, 0), (0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 0, 1), (3, 0, 0), (5, 5, 5)]",
+]
+ODD = {
+    "counts": ["[]", "[2]", "[4]", "[4, 4]", "[0, 4]", "[-1, 4]", "[100000000]", "[3, 1, 4]"],
+    "widths": ["[]", "[0.1]", "[0, 0]", "[nan, 0.1, 0.1, 0.1]", "[-1]", "[1e30]", "[0.1, 0.2]"],
+    "order": ["[]", "[4]", "[1]", "[2, 3]", "[-5]", "[40]", "[3]"],
+    "knots": ["[]", "[0, 0, 0, 0, 1, 1, 1, 1]", "[0, 1, 2, 3, 4, 5, 6, 7]", "[7, 6, 5, 4, 3, 2, 1, 0]", "[nan, 0, 1]"],
+    "ranges": ["[]", "[(0, 1)]", "[(1, 0)]", "[(nan, 1)]", "[(-5, 50)]"],
+}
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_odd_arrays_are_survived(tmp_path, seed):
+    """Arrays of any length, with any numbers, give finite triangles or none."""
+    choose = np.random.default_rng(seed).choice
+    odd = {name: choose(values) for name, values in ODD.items()}
+    kind = choose(["BasisCurves", "HermiteCurves", "NurbsCurves", "Points", "NurbsPatch"])
+    text = f"""def {kind} "P" {{
+        point3f[] points = {choose(POINTS)}
+        float[] widths = {odd["widths"]} (interpolation = "{choose(["constant", "uniform", "varying", "vertex"])}")
+        {f"int[] curveVertexCounts = {odd['counts']}" if "Curves" in kind else ""}
+        {f"normal3f[] normals = {choose(POINTS)}" if choose(2) and "Curves" in kind else ""}
+        {f"vector3f[] tangents = {choose(POINTS)}" if kind == "HermiteCurves" else ""}
+        color3f[] primvars:displayColor = {choose(POINTS)} (interpolation = "{choose(["uniform", "vertex"])}")
+    """
+    if kind == "BasisCurves":
+        text += f"""uniform token type = "{choose(["linear", "cubic"])}"
+        uniform token basis = "{choose(["bezier", "bspline", "catmullRom", "power"])}"
+        uniform token wrap = "{choose(["nonperiodic", "periodic", "pinned"])}"
+        """
+    if kind == "NurbsCurves":
+        text += f"int[] order = {odd['order']}\n double[] knots = {odd['knots']}\n double2[] ranges = {odd['ranges']}\n"
+    if kind == "NurbsPatch":
+        text += f"""int uVertexCount = {choose([2, 4, -1])}
+        int vVertexCount = {choose([2, 1])}
+        int uOrder = {choose([2, 4, 0])}
+        int vOrder = {choose([2, 1])}
+        double[] uKnots = {odd["knots"]}
+        double[] vKnots = {choose(["[0, 0, 1, 1]", odd["knots"]])}
+        int[] trimCurve:counts = [1]
+        int[] trimCurve:orders = {odd["order"]}
+        int[] trimCurve:vertexCounts = {odd["counts"]}
+        double[] trimCurve:knots = {odd["knots"]}
+        """
+    for mesh in load(tmp_path, text + "}\n").meshes:
+        assert np.isfinite(mesh.points[mesh.triangles]).all() and np.isfinite(mesh.normals).all()
