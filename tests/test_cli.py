@@ -166,6 +166,11 @@ def test_hint_of_exposure(tmp_path, capsys, intensity, what):
     assert hint
     assert main([*command, "--exposure", hint[1]]) == 0
     assert "hint" not in capsys.readouterr().err
+    assert main([*command, "--exposure", "auto"]) == 0
+    errors = capsys.readouterr().err
+    assert "hint" not in errors
+    automatic = re.search(r"--exposure auto: (\S+) stops", errors)
+    assert automatic and float(automatic[1]) == pytest.approx(float(hint[1]), abs=0.26)  # the hint is in half stops
 
 
 # ---- interruption ----------------------------------------------------------------------------------------

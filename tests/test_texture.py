@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ir.image.mipmap import mip_chain, resized
+from warp_ir.image.mipmap import mip_chain, resized, value_range
 from warp_ir.scene import Texture, Wrap
 from warp_ir.texture import TextureTable, lookup, mean_on_triangles, mip_level, upload_textures, uv_to_st
 
@@ -142,3 +142,20 @@ def test_estimates_of_glow_never_miss(launcher, wrap, footprint):
     found = look(launcher, texture, points.reshape(-1, 2), 1.0, footprint).mean(axis=1).reshape(400, 256)
     assert (estimates[found.max(axis=1) > 0.0] > 0.0).all()
     assert estimates.sum() == pytest.approx(found.mean(axis=1).sum(), rel=2.0 if wrap == Wrap.BLACK else 0.2)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_the_range_of_an_image(dtype):
+    """It is that of NumPy, with and without negative values, and tells NaN and infinities."""
+    pixels = np.random.default_rng(0).random((8, 8, 4)).astype(dtype)
+    for image in (pixels, pixels - dtype(0.5), pixels[..., :3], np.zeros_like(pixels)):
+        assert value_range(image) == (image.min(), image.max())
+    for wrong in (np.nan, np.inf, -np.inf):
+        pixels[3, 3, 3] = wrong
+        assert not np.isfinite(value_range(pixels)).all()
+
+
+def test_the_mean_of_a_large_image_is_exact():
+    """Rows are added in single precision, blocks of them in double: 1e-6 of a mean of a million equal signs."""
+    pixels = np.random.default_rng(0).random((1100, 1000, 3)).astype(np.float16)
+    assert Texture("t", pixels).mean == pytest.approx(pixels.mean(axis=(0, 1), dtype=np.float64), rel=1e-6)

@@ -456,3 +456,18 @@ print(scene.triangle_count, time.perf_counter() - start, resource.getrusage(reso
     count, seconds, kibibytes = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     assert count == "1024000"
     assert float(seconds) < 5.0 and int(kibibytes) < 1_000_000
+
+
+def test_equal_shapes_share_what_does_not_move(tmp_path):
+    """A thousand cubes of one size keep one array of triangles and, by colour, one of materials."""
+    cubes = "".join(
+        f'def Cube "C{k}" {{ double3 xformOp:translate = ({3 * k}, 0, 0)\n'
+        'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+        f"color3f[] primvars:displayColor = [({k % 2}, 0, 0)]\n}}\n"
+        for k in range(6)
+    )
+    scene = load(tmp_path, cubes + 'def Cube "D" {\ndouble size = 4\n}')
+    *equal, other = scene.meshes
+    assert len({id(mesh.triangles.base) for mesh in equal}) == 1 and area(other) == pytest.approx(96.0)
+    assert [mesh.points[:, 0].mean() for mesh in equal] == pytest.approx([3.0 * k for k in range(6)])
+    assert [scene.materials[mesh.material[0]].albedo[0] for mesh in equal] == [0.0, 1.0] * 3

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ir.device.launcher import Launcher
-from warp_ir.image.mipmap import mip_chain, resized
+from warp_ir.image.mipmap import mip_chain, resized, value_range
 from warp_ir.scene import Floats, Texture, Wrap
 
 wp.set_module_options({"enable_backward": False})
@@ -156,17 +156,21 @@ def upload_textures(textures: Sequence[Texture], uv_sets: Sequence[str], launche
     for k, (texture, pixels) in enumerate(zip(textures, _within_budget(textures), strict=True)):
         chain = mip_chain(pixels)
         # Half floats hold 11 bits between 6e-5 and 65504: texels are scaled to at most 1, whatever their unit.
-        largest = max(float(pixels.max()), -float(pixels.min()))
-        scale = 2.0 ** math.frexp(largest)[1] if largest > 0.0 else 1.0
+        low, high = value_range(pixels)
+        largest = max(high, -low)
+        scale = 2.0 ** math.ceil(math.log2(largest)) if largest > 0.0 else 1.0
         rows[k]["first_level"], rows[k]["level_count"], rows[k]["channels"] = len(levels), len(chain), pixels.shape[2]
         rows[k]["wrap_s"], rows[k]["wrap_t"] = texture.wrap
         rows[k]["scale"] = scale
         rows[k]["uv_set"] = uv_sets.index(texture.uv)
         rows[k]["s"], rows[k]["t"] = texture.transform
         rows[k]["outside"] = texture.outside
+        if pixels.dtype == np.float16 and scale == 1.0:
+            chain[0] = pixels  # as it is stored
         for level in chain:
             levels.append((level.shape[1], level.shape[0], total))
-            texels.append((level / np.float32(scale)).astype(np.float16).reshape(-1))
+            scaled = level if scale == 1.0 else level / np.float32(scale)
+            texels.append(scaled.astype(np.float16, copy=False).reshape(-1))
             total += level.size
     table.rows = launcher.array(rows, TextureRow)
     table.levels = launcher.array(np.array(levels or [(1, 1, 0)], np.int32), wp.vec3i)

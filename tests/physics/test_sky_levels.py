@@ -190,3 +190,21 @@ def test_links_to_instances(tmp_path, written, monkeypatch):
     both = "rel collection:shadowLink:excludes = </I2>\n    rel collection:lightLink:excludes = "
     assert found(both + "</I0>") == 0.0
     assert_level(found(both + "</I1>"), free, 2e-3)
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_the_default_sky(tmp_path, up):
+    """The ground of the overcast sky has E = π; a wall, E by quadrature of sky and ground over the half space."""
+    head = f'#usda 1.0\n(upAxis = "{up}")\n'
+    found = level(
+        load(tmp_path, head + floor() + EYE, default_light="sky", warnings=["overcast"]), "vpl", iterations=16
+    )
+    expected = 1.0
+    if up == "Z":  # the floor of the plane y = 0 stands upright
+        elevation, azimuth = np.meshgrid(
+            (np.arange(1000) + 0.5) * math.pi / 1000 - 0.5 * math.pi, (np.arange(500) + 0.5) * math.pi / 500
+        )
+        radiance = np.where(elevation > 0.0, 9.0 / 7.0 * (1.0 + 2.0 * np.sin(elevation)) / 3.0, 0.25)
+        projected = radiance * np.cos(elevation) ** 2 * np.sin(azimuth)
+        expected = float(projected.sum() * (math.pi / 1000) * (math.pi / 500)) / math.pi
+    assert_level(found, np.full(3, expected), 0.01)

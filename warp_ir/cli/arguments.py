@@ -447,8 +447,11 @@ def _add_looks(output: argparse._ArgumentGroup) -> None:
         metavar="NAME ...",
         help=f"also write {', '.join(AOV_CHANNELS)}: as layers of an EXR file, otherwise as files next to it",
     )
-    stops = "brightness of .png, .jpg and .tif: each stop doubles the radiance (default: 0)"
-    output.add_argument("--exposure", type=_stops, default=0.0, metavar="STOPS", help=stops)
+    stops = (
+        "brightness of .png, .jpg and .tif: each stop doubles the radiance (default: 0); auto: the first picture's "
+        "log-average luminance becomes middle grey, and all frames are as bright"
+    )
+    output.add_argument("--exposure", type=_stops_or_auto, default=0.0, metavar="STOPS|auto", help=stops)
     output.add_argument(
         "--tonemap",
         choices=TONEMAPS,
@@ -657,9 +660,10 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     group.add_argument("--sessionLayer", dest="session_layer", help=hidden)
     group.add_argument(
         "--default-light",
-        choices=("none", "dome"),
+        choices=("none", "dome", "sky"),
         default="dome",
-        help="light for a stage in which nothing emits (default: dome)",
+        help="light for a stage in which nothing emits: none, a white dome, or an overcast sky over grey ground "
+        "(default: dome)",
     )
     config = "OpenColorIO configuration, for textures and pictures: a file, or ocio://default (default: $OCIO)"
     group.add_argument("--ocio-config", metavar="FILE", help=config)
@@ -777,6 +781,10 @@ def _fraction(text: str) -> float:
     if not 0.0 <= value <= 1.0:
         raise argparse.ArgumentTypeError(f"must be from 0 to 1, is {text.strip()}")
     return value
+
+
+def _stops_or_auto(text: str) -> float | str:
+    return text if text == "auto" else _stops(text)
 
 
 def _stops(text: str) -> float:

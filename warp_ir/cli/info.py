@@ -163,6 +163,8 @@ def _guesses(scene: Scene, cameras: Sequence[str]) -> dict[str, str]:
         guesses["settings"] = "the first RenderSettings of the stage"
     if any(light.name == "default dome" for light in scene.lights):
         guesses["light"] = "a white dome of radiance 1 (nothing emits)"
+    if any(light.name == "default sky" for light in scene.lights):
+        guesses["light"] = "an overcast sky (nothing emits)"
     return guesses
 
 

@@ -27,7 +27,7 @@ from warp_ir.files import check_output, whole_file
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
 from warp_ir.image.io import DISPLAYED, SUFFIXES, aov_path, can_hold_key, read_image, read_key, write_image
 from warp_ir.image.ocio import check_view
-from warp_ir.image.tonemap import TONEMAPS, suggest_exposure
+from warp_ir.image.tonemap import TONEMAPS, automatic_exposure, suggest_exposure
 from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 
@@ -77,6 +77,8 @@ class _Job:
     """Time in which the latest picture was written [s]."""
     warned: set[str] = field(default_factory=set)
     """Warnings that have been printed."""
+    exposure: float | None = None
+    """Exposure of all pictures [stops]; None: the first one decides, when it is written."""
 
 
 def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
@@ -106,11 +108,14 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
     if args.preview:
         from warp_ir.view.film_preview import FilmPreview
 
-        preview = FilmPreview(f"{args.stage} - warp-ir", args.exposure, args.tonemap or TONEMAPS[0])
+        preview = FilmPreview(
+            f"{args.stage} - warp-ir", 0.0 if args.exposure == "auto" else args.exposure, args.tonemap or TONEMAPS[0]
+        )
     with ProgressDisplay("opening", quiet=args.quiet):
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
-    job = _Job(args, device, versions, reader, view, films, preview)
+    exposure = None if args.exposure == "auto" else args.exposure
+    job = _Job(args, device, versions, reader, view, films, preview, exposure=exposure)
     if films:
         pictures = [_merged_picture(job)]
     elif into_folder:
@@ -314,6 +319,8 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         }
         if picture.time is not None:
             metadata["frame"] = picture.time
+        if job.exposure is None:
+            job.exposure = round(automatic_exposure(film.radiance()), 2) + 0.0
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             try:
@@ -322,7 +329,7 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                         file,
                         film,
                         aovs=_aovs(job, picture, file),
-                        exposure=args.exposure,
+                        exposure=job.exposure,
                         tonemap=args.tonemap or TONEMAPS[0],
                         view=job.view,
                         half=args.half,
@@ -517,10 +524,13 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
     if film.rejected:
         warn(f"{film.rejected} non-finite samples were replaced")
     if path.suffix.lower() in DISPLAYED:
-        stops = suggest_exposure(film.radiance(), job.args.exposure)
-        if stops is not None:
-            brightness = "dark" if stops > job.args.exposure else "bright"
-            say(f"hint: the picture is very {brightness}; --exposure {stops:g} would correct this")
+        assert job.exposure is not None  # since a picture is written
+        stops = suggest_exposure(film.radiance(), job.exposure)
+        if job.args.exposure == "auto":
+            say(f"--exposure auto: {job.exposure:g} stops")
+        elif stops is not None:
+            brightness = "dark" if stops > job.exposure else "bright"
+            say(f"hint: the picture is very {brightness}; --exposure {stops:g} would correct this, --exposure auto too")
 
 
 def _write_stats(path: Path, job: _Job, imported: float, frames: list[dict[str, Any]]) -> None:

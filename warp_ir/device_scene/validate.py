@@ -1,11 +1,13 @@
 """Checks of a scene before it is uploaded."""
 
+import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.geometry_storage import emissive_meshes
+from warp_ir.image.mipmap import value_range
 from warp_ir.memory import gibibytes
 from warp_ir.scene import MAX_RADIANCE, InputError, LightKind, Material, Mesh, Scene, materials_of
 
@@ -95,17 +97,18 @@ def _check_material(material: Material) -> None:
         pixels = texture.pixels
         shaped = pixels.ndim == 3 and min(pixels.shape) >= 1 and pixels.shape[2] in (1, 3)
         demand(shaped, f"texture {texture.name}: pixels must have shape [h, w, 3] or [h, w, 1]")
-        demand(np.isfinite(pixels).all(), f"texture {texture.name}: pixels must be finite")
+        low, high = value_range(pixels)
+        demand(math.isfinite(low) and math.isfinite(high), f"texture {texture.name}: pixels must be finite")
         signed = texture is material.normal_texture
-        demand(signed or pixels.min() >= 0.0, f"texture {texture.name}: pixels must not be negative")
-        usable = not signed or (pixels.shape[2] == 3 and float(np.abs(pixels).max()) <= _MAX_NORMAL_COMPONENT)
+        demand(signed or low >= 0.0, f"texture {texture.name}: pixels must not be negative")
+        usable = not signed or (pixels.shape[2] == 3 and max(-low, high) <= _MAX_NORMAL_COMPONENT)
         demand(usable, f"texture {texture.name}: normals have three channels, each at most {_MAX_NORMAL_COMPONENT:g}")
         placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
         demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
         demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")
     for bounded in (material.albedo_texture, material.opacity_texture):
         if bounded is not None:
-            top = max(bounded.pixels.max(), *bounded.outside)
+            top = max(value_range(bounded.pixels)[1], *bounded.outside)
             demand(top <= 1.0 and min(bounded.outside) >= 0.0, f"texture {bounded.name}: values must lie in [0, 1]")
 
 

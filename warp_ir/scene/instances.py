@@ -33,6 +33,8 @@ def transform_copies(
         Points float64 [k n, 3], triangles int32 [k m, 3] and normals float32 [k m, 3, 3] or None, copy after copy.
     """
     copies, count = len(matrices), len(points)
+    if copies == 1 and (matrices[0] == np.eye(4)).all():
+        return points.astype(np.float64, copy=False), triangles, normals
     linear = matrices[:, :3, :3]
     transformed = np.matmul(points, linear.transpose(0, 2, 1)) + matrices[:, None, :3, 3]
     offsets = (np.arange(copies) * count).astype(np.int32)

@@ -16,7 +16,8 @@ _AREAS_BY_MATERIAL: WeakKeyDictionary[Mesh, Floats] = WeakKeyDictionary()
 _ALBEDO_INTEGRALS: WeakKeyDictionary[Mesh, float] = WeakKeyDictionary()
 _MATERIALS: WeakKeyDictionary[Mesh, tuple[int, ...]] = WeakKeyDictionary()
 _AREAS_OF_COPIES: WeakKeyDictionary[Instances, WeakKeyDictionary[Mesh, Floats]] = WeakKeyDictionary()
-_BOXES: WeakKeyDictionary[Mesh | Instances, WeakKeyDictionary[Mesh, tuple[Floats, Floats]]] = WeakKeyDictionary()
+_MESH_BOXES: WeakKeyDictionary[Mesh, tuple[Floats, Floats]] = WeakKeyDictionary()
+_BOXES: WeakKeyDictionary[Instances, WeakKeyDictionary[Mesh, tuple[Floats, Floats]]] = WeakKeyDictionary()
 
 
 def materials_of(mesh: Mesh) -> tuple[int, ...]:
@@ -61,11 +62,20 @@ def world_areas(mesh: Mesh, group: Instances | None) -> Floats:
 
 def world_bounds(mesh: Mesh, group: Instances | None) -> tuple[Floats, Floats]:
     """Lower and upper corner [3] of the world-space box around the triangles of a mesh, or around all of its copies."""
-    cache = _BOXES.setdefault(group or mesh, WeakKeyDictionary())
+    if group is None:
+        box = _MESH_BOXES.get(mesh)
+        if box is None:
+            used = _used_points(mesh)
+            box = _MESH_BOXES[mesh] = used.min(axis=0), used.max(axis=0)
+        return box
+    cache = _BOXES.setdefault(group, WeakKeyDictionary())
     if mesh not in cache:
-        used = mesh.points[np.unique(mesh.triangles)]
-        if group is None:
-            cache[mesh] = (used.min(axis=0), used.max(axis=0))
-        else:
-            cache[mesh] = bounds_of_copies(used, group.matrices)
+        cache[mesh] = bounds_of_copies(_used_points(mesh), group.matrices)
     return cache[mesh]
+
+
+def _used_points(mesh: Mesh) -> Floats:
+    """The points that are part of a triangle."""
+    is_used = np.zeros(len(mesh.points), dtype=bool)
+    is_used[mesh.triangles] = True
+    return mesh.points if is_used.all() else mesh.points[is_used]

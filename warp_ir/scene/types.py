@@ -51,6 +51,19 @@ def keep_read_only(record: object, label: str, names: Sequence[str]) -> None:
             object.__setattr__(record, name, view)
 
 
+def pixel_mean(pixels: Floats) -> Floats:
+    """The mean of an image [h, w, c], float64 [c]; few rows at a time are added in single precision."""
+    if pixels.dtype == np.float64 or pixels.size < 2**16 or pixels.ndim != 3:
+        return np.asarray(np.mean(pixels, axis=(0, 1), dtype=np.float64))
+    height, width, channels = pixels.shape
+    total = np.zeros(channels)
+    for first in range(0, height, 64):
+        rows = pixels[first : first + 64].astype(np.float32, copy=False).reshape(-1, width * channels)
+        total += (np.ones(len(rows), np.float32) @ rows).reshape(width, channels).sum(axis=0, dtype=np.float64)
+    mean: Floats = total / (height * width)
+    return mean
+
+
 class LightKind(IntEnum):
     """The shapes of a `Light`; comments give them in the light's local space, as UsdLux defines it."""
 
@@ -95,7 +108,7 @@ class Texture:
     @cached_property
     def mean(self) -> Color:
         """Mean of the pixels; an image of one channel is grey."""
-        red, green, blue = np.broadcast_to(np.mean(self.pixels, axis=(0, 1), dtype=np.float64), 3).tolist()
+        red, green, blue = np.broadcast_to(pixel_mean(self.pixels), 3).tolist()
         return red, green, blue
 
 

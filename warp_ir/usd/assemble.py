@@ -4,13 +4,17 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pxr import Sdf, Usd, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
+from warp_ir.usd.geometry.curves import CURVES, read_curves
+from warp_ir.usd.geometry.detail import PixelSize
+from warp_ir.usd.geometry.displacement import displaced
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
 from warp_ir.usd.geometry.mesh import read_mesh, read_tet_mesh
+from warp_ir.usd.geometry.patch import read_patch
 from warp_ir.usd.geometry.prototypes import (
     MAX_FLATTENED_TRIANGLES,
     InstancedGprim,
@@ -20,9 +24,10 @@ from warp_ir.usd.geometry.prototypes import (
     well_conditioned,
 )
 from warp_ir.usd.geometry.skinning import Skinning, pose_key
+from warp_ir.usd.geometry.spheres import read_spheres
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue
+from warp_ir.usd.images.shading_value import ShadingValue, look_up
 from warp_ir.usd.lights.mesh_light import LIGHT_UV, MeshLightPrim
 from warp_ir.usd.linking import LightLinks
 from warp_ir.usd.shading.binding import PURPOSES
@@ -35,6 +40,9 @@ from warp_ir.usd.values.triangles import TriangleMesh, cross_products, drop_dege
 
 ShapeCache = dict[tuple[Sdf.Path, ...], TriangleMesh | None]
 """Shapes by prim and skinning; None: the prim cannot be read or has no triangles."""
+
+_DETAILED = (*CURVES, "NurbsPatch", "Points")
+"""Schemas whose shapes depend on how large they are in the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +62,8 @@ class _Gprim:
     shape: TriangleMesh
     assignment: MaterialAssignment
     emits: bool
+    light: bool = False
+    """Whether it is a light (`_mesh_light`)."""
 
 
 @dataclass(eq=False)
@@ -78,6 +88,7 @@ def build_meshes(
     purposes: Sequence[str] = PURPOSES[:2],
     links: LightLinks | None = None,
     times: int = 1,
+    pixel: PixelSize | None = None,
 ) -> Geometry:
     """Meshes of gprims (one per gprim, with all its copies), instanced prototypes, and the materials that they use.
 
@@ -92,13 +103,15 @@ def build_meshes(
         purposes: Purposes of material bindings, in order of preference.
         links: Light links, by which copies of a gprim may differ.
         times: Number of shutter samples for which the gprims are read.
+        pixel: The size of a pixel of the picture; None: not known.
 
     Raises:
         InputError: There are more triangles than can be rendered.
     """
-    table = MaterialTable(time, report, images, metals, purposes)
+    table = MaterialTable(time, report, images, metals, purposes, displaces=levels > 0)
     shape_cache = {} if shapes is None else shapes
-    return _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(())).run(gprims, times)
+    builder = _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(()), pixel)
+    return builder.run(gprims, times)
 
 
 class _MeshBuilder:
@@ -112,11 +125,15 @@ class _MeshBuilder:
         table: MaterialTable,
         shapes: ShapeCache,
         links: LightLinks,
+        pixel: PixelSize | None,
     ) -> None:
         self._time, self._report, self._levels, self._table = time, report, levels, table
-        self._links = links
+        self._links, self._pixel = links, pixel
+        self._places: dict[Sdf.Path, list[Floats]] = {}
         self._skinning = Skinning(time, report)
         self._shapes = shapes
+        self._plain_gprims: dict[tuple[int, Hashable], _Gprim] = {}
+        self._displaced_shapes: dict[tuple[object, ...], TriangleMesh] = {}
         self._gprim_cache: dict[tuple[object, ...], tuple[TriangleMesh, MaterialAssignment, bool]] = {}
         self._placed_cache: dict[tuple[object, ...], tuple[Floats, Ints, Floats | None]] = {}
         self._mesh_lights: dict[Sdf.Path, MeshLightPrim] = {}
@@ -126,12 +143,19 @@ class _MeshBuilder:
     def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
         self._table.resolve([drawn.prim for drawn in drawn_prims])
+        for drawn in drawn_prims:
+            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
+                self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
+        singles = self._single_meshes(gprims)
         meshes: list[Mesh] = []
         prototypes: dict[int, _Prototype] = {}
         for stored in choose_storage(parts, self._report.source, times):
             gprim, group = gprims[stored.gprim], stored.prototype
+            if stored.gprim in singles:
+                meshes.append(singles[stored.gprim])
+                continue
             matrices_in_level = nested_transforms(level.matrices for level in stored.levels)
             colors = nested_colors((len(level.matrices), level.colors) for level in stored.levels)
             if group is None:
@@ -163,6 +187,44 @@ class _MeshBuilder:
         used_meshes, materials = self._without_unused_materials(meshes)
         return Geometry(used_meshes, tuple(instances), materials)
 
+    def _single_meshes(self, gprims: Sequence[_Gprim]) -> dict[int, Mesh]:
+        """Meshes of the gprims that are no lights and in no instance, by index; equal shapes are placed at once."""
+        by_shape: dict[int, list[int]] = {}
+        for k, gprim in enumerate(gprims):
+            if gprim.drawn.level.parent is None and not gprim.light:
+                by_shape.setdefault(id(gprim.shape), []).append(k)
+        meshes: dict[int, Mesh] = {}
+        for indices in by_shape.values():
+            shape = gprims[indices[0]].shape
+            matrices = np.stack([gprims[k].drawn.level_from_prim for k in indices])
+            determinants = np.linalg.det(matrices[:, :3, :3])
+            regular = np.isfinite(matrices).all(axis=(1, 2)) & (determinants > 0.0)
+            chosen = np.flatnonzero(regular)
+            if len(chosen) == 0:
+                continue
+            points, _, normals = instantiate(shape, matrices[chosen])
+            rows = points.reshape(len(chosen), -1, 3)
+            normal_rows = None if normals is None else normals.reshape(len(chosen), -1, 3, 3)
+            for row, k in enumerate(chosen.tolist()):
+                drawn, assignment = gprims[indices[k]].drawn, gprims[indices[k]].assignment
+                own_normals = None if normal_rows is None else normal_rows[row]
+                tangents = None
+                if assignment.uvs:
+                    placed = rows[row], shape.triangles, own_normals
+                    tangents = self._tangents(*placed, assignment.uvs, assignment.material)
+                meshes[indices[k]] = Mesh(
+                    str(drawn.prim.GetPath()),
+                    rows[row],
+                    shape.triangles,
+                    assignment.material,
+                    own_normals,
+                    assignment.colors,
+                    self._double_sided(drawn),
+                    assignment.uvs,
+                    tangents=tangents,
+                )
+        return meshes
+
     @staticmethod
     def _add(meshes: list[Mesh], mesh: Mesh | None) -> list[int]:
         """Appends a mesh unless it is None; returns the list of its index."""
@@ -173,11 +235,18 @@ class _MeshBuilder:
 
     def _gprim(self, drawn: DrawnPrim) -> _Gprim | None:
         """A gprim without its fully transparent triangles; equal shapes with equal materials are stored once."""
-        full = self._shape(drawn.prim)
+        full = self._shape(drawn)
         if full is None:
             return None
-        assignment = self._table.assign(drawn.prim, full)
         mesh_light = self._mesh_light(drawn)
+        plain = (
+            self._table.key(drawn.prim, drawn.authored) if mesh_light is None and drawn.level.parent is None else None
+        )
+        if plain is not None and (id(full), plain) in self._plain_gprims:
+            alike = self._plain_gprims[id(full), plain]
+            return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
+        assignment = self._table.assign(drawn.prim, full)
+        full = self._displaced(drawn.prim, full, assignment)
         if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
             corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
             assignment = (
@@ -197,7 +266,34 @@ class _MeshBuilder:
         if len(shape.triangles) == 0:
             return None
         drawn, assignment = self._with_instance_primvars(drawn, assignment)
-        return _Gprim(drawn, shape, assignment, emits or mesh_light is not None)
+        is_light = mesh_light is not None
+        gprim = _Gprim(drawn, shape, assignment, emits or is_light, is_light)
+        if plain is not None and shape is full:
+            self._plain_gprims[id(full), plain] = gprim
+        return gprim
+
+    def _displaced(self, prim: Usd.Prim, shape: TriangleMesh, assignment: MaterialAssignment) -> TriangleMesh:
+        """The shape displaced as its materials say, cached; the same shape if they do not."""
+        used = [k for k in np.unique(assignment.material).tolist() if k in self._table.displacements]
+        if not used:
+            return shape
+        if shape.refiner is None or not prim.IsA(UsdGeom.Mesh):
+            self._report.warn(prim.GetPath(), "only subdivision surfaces are displaced ({n} in all)")
+            return shape
+        key = id(shape), digest(assignment.material), _shared_path(prim)
+        if key not in self._displaced_shapes:
+            amounts = np.zeros(shape.triangles.shape)
+            for k in used:
+                value, chosen = self._table.displacements[k], assignment.material == k
+                if value.primvars:
+                    self._report.warn(self._table.materials[k].name, "displacement by primvars takes its fallback")
+                uvs: Floats | None = np.zeros((*shape.triangles.shape, 2))
+                if value.mapping is not None:
+                    uvs = texture_coordinates(prim, shape, value.mapping.uv, self._time, self._report)
+                if uvs is not None:
+                    amounts[chosen] = look_up(value, uvs[chosen])[..., 0]
+            self._displaced_shapes[key] = displaced(shape, amounts)
+        return self._displaced_shapes[key]
 
     def _with_instance_primvars(
         self, drawn: DrawnPrim, assignment: MaterialAssignment
@@ -273,6 +369,8 @@ class _MeshBuilder:
 
     def _signature(self, gprim: _Gprim) -> object:
         """Equal for gprims of a prototype that look equal and are lit equally; cached objects are compared by id."""
+        if gprim.drawn.level.parent is None:
+            return None  # the world is no prototype
         links = self._links.memberships(gprim.drawn.prim.GetPath())
         return id(gprim.shape), id(gprim.assignment), digest(gprim.drawn.level_from_prim), links
 
@@ -301,13 +399,13 @@ class _MeshBuilder:
         copy_colors = nested_colors([(len(matrices), outer_colors), (len(matrices_in_level), colors)])
         return self._mesh(gprim, nested_transforms([matrices, matrices_in_level]), copy_colors)
 
-    def _shape(self, prim: Usd.Prim) -> TriangleMesh | None:
+    def _shape(self, drawn: DrawnPrim) -> TriangleMesh | None:
         """The prim's triangles in its own space, cached; instances of a native prototype share them."""
-        shared = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
-        key = (shared, *pose_key(prim))
+        prim = drawn.prim
+        key = (_shared_path(prim), *pose_key(prim))
         if key not in self._shapes:
             try:
-                shape = self._read(prim)
+                shape = self._read(drawn)
             except Unreadable as trouble:
                 self._report.warn(prim.GetPath(), f"{trouble}; the prim is skipped")
                 shape = None
@@ -317,13 +415,21 @@ class _MeshBuilder:
             self._shapes[key] = shape if shape is not None and len(shape.triangles) else None
         return self._shapes[key]
 
-    def _read(self, prim: Usd.Prim) -> TriangleMesh | None:
+    def _read(self, drawn: DrawnPrim) -> TriangleMesh | None:
         """The shape of a gprim by its schema."""
+        prim = drawn.prim
         schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if schema in IMPLICIT:
-            return read_implicit(prim, schema, self._time)
+            return read_implicit(prim, schema, self._time, drawn.authored)
         if schema == "TetMesh":
             return read_tet_mesh(prim, self._time, self._report)
+        if schema in _DETAILED:
+            places = np.concatenate(self._places[_shared_path(prim)])
+            if schema == "NurbsPatch":
+                return read_patch(prim, self._time, self._report, places, self._pixel)
+            if schema == "Points":
+                return read_spheres(prim, self._time, self._report, places, self._pixel)
+            return read_curves(prim, schema, self._time, self._report, places, self._pixel, self._skinning)
         return read_mesh(prim, self._time, self._report, self._levels, self._skinning)
 
     def _mesh(
@@ -378,14 +484,19 @@ class _MeshBuilder:
             material = np.array([self._table.add(m) for m in light_materials], dtype=np.int32)[material]
             if not any(max(m.albedo) > 0.0 for m in light_materials):
                 colors = None  # a light without material response reflects nothing, whatever its primvars
-        # The schema's fallback applies: of the implicit shapes only Plane is double-sided.
-        double_sided = read.flag(prim.GetAttribute("doubleSided"), self._time)
+        double_sided = self._double_sided(gprim.drawn)
         tangents = self._tangents(points, triangles, normals, uvs, material)
         return Mesh(
             *(str(prim.GetPath()), points, triangles, material, normals, colors, double_sided, uvs, bare),
             tangents=tangents,
             light=light,
         )
+
+    def _double_sided(self, drawn: DrawnPrim) -> bool:
+        """Whether an emissive gprim emits on both sides; the schema's fallback is true for Plane alone."""
+        if "doubleSided" in drawn.authored or drawn.prim.GetTypeName() == "Plane":
+            return read.flag(drawn.prim.GetAttribute("doubleSided"), self._time)
+        return False
 
     def _tangents(
         self, points: Floats, triangles: Ints, normals: Floats | None, uvs: Mapping[str, Floats], material: Ints
@@ -430,9 +541,16 @@ class _MeshBuilder:
         self._report.stats["unused_materials"] = int((~used).sum())
         if not used.any():
             return tuple(meshes), (Material(),)
+        if used.all():
+            return tuple(meshes), tuple(table)
         index = (np.cumsum(used) - 1).astype(np.int32)
         remapped = tuple(replace(mesh, material=index[mesh.material]) for mesh in meshes)
         return remapped, tuple(m for m, is_used in zip(table, used, strict=True) if is_used)
+
+
+def _shared_path(prim: Usd.Prim) -> Sdf.Path:
+    """The path by which a prim's shape is cached: that in the prototype for prims of native instances."""
+    return (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
 
 
 def _fill_with_geometric_normals(normals: Floats, points: Floats, triangles: Ints) -> Floats:

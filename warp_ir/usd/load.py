@@ -14,9 +14,11 @@ from warp_ir.scene import Camera, InputError, Light, LightKind, Mesh, Scene
 from warp_ir.usd.assemble import Geometry, ShapeCache, build_meshes
 from warp_ir.usd.camera_prim import all_cameras, eye_camera, find_camera, framing_camera, read_camera, read_shutter
 from warp_ir.usd.diagnose import diagnose_black_picture, diagnose_dark_lights
+from warp_ir.usd.geometry.detail import PixelSize, pixel_size
 from warp_ir.usd.geometry.prototypes import reuse_prototypes
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.lights.light import LIGHTS, read_light
+from warp_ir.usd.lights.sky import overcast_sky
 from warp_ir.usd.linking import LightLinks, link_lights
 from warp_ir.usd.settings.render_pass import find_render_pass
 from warp_ir.usd.settings.render_spec import Product, RenderSpec, read_render_spec
@@ -144,7 +146,8 @@ class StageReader:
                 default and render.
             complexity: Refinement of subdivision surfaces: "low" draws their cages, "medium", "high" and "veryhigh"
                 one, two and three levels of refinement.
-            default_light: What to do if nothing emits: "dome" adds a uniform white dome of radiance 1, "none" nothing.
+            default_light: What to do if nothing emits: "dome" adds a uniform white dome of radiance 1, "sky" an
+                overcast sky over grey ground, "none" nothing.
             metals: "diffuse" renders a metal as a diffuse surface of its base colour, "black" without its reflection.
             texture_wrap: Wrap mode of textures for which the file gives none: "black" (the specification's default),
                 "clamp", "repeat" or "mirror".
@@ -167,8 +170,8 @@ class StageReader:
             raise InputError(f"purposes: {purposes!r} is not a selection of {', '.join(_PURPOSES)}")
         if complexity not in _REFINEMENT_LEVELS:
             raise InputError(f"complexity: {complexity!r} is none of {', '.join(_REFINEMENT_LEVELS)}")
-        if default_light not in ("dome", "none"):
-            raise InputError(f"default_light: '{default_light}' is neither 'dome' nor 'none'")
+        if default_light not in ("dome", "sky", "none"):
+            raise InputError(f"default_light: '{default_light}' is not one of 'dome', 'sky', 'none'")
         if metals not in ("diffuse", "black"):
             raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
         if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
@@ -203,6 +206,7 @@ class StageReader:
         self._moving_report = self._open_report.section()
         self._times = 1  # for which moving gprims are read: 1, or the number of shutter samples
         self._moving_triangles = 0  # stored anew at every time
+        self._pixel: PixelSize | None = None  # of the picture; None: not known, or not the same at all times
         self._prototypes: tuple[Mesh, ...] = ()  # of moving instances, at the last time
 
     def spec(self, time: float | str | None = None) -> RenderSpec:
@@ -320,6 +324,13 @@ class StageReader:
     def _scene(self, time: Usd.TimeCode, camera: Usd.Prim | None, spec: RenderSpec, report: Report) -> Scene:
         """The scene at one time, without shutter samples."""
         camera_record = None if camera is None else read_camera(camera, time, report)
+        if self._eye is not None:
+            ahead = (self._eye[0] + 1.0, *self._eye[1:])  # where it looks does not matter
+            self._pixel = pixel_size(eye_camera(self._eye, ahead, self._up_axis))
+        elif camera is not None and camera_record is not None and not self._time_varying.varies(camera):
+            self._pixel = pixel_size(camera_record)
+        else:
+            self._pixel = None
         purposes = tuple(self._purposes or spec.purposes or _DEFAULT_PURPOSES)
         key = _StaticKey(purposes, spec.material_purposes, time.IsDefault())
         self._time_varying.purposes = spec.material_purposes
@@ -350,6 +361,10 @@ class StageReader:
                 if meshes:
                     report.warn("/", "nothing emits light; a uniform white dome of radiance 1 is added")
                 lights = (_DEFAULT_DOME,)
+            elif self._default_light == "sky":
+                if meshes:
+                    report.warn("/", "nothing emits light; an overcast sky over grey ground is added")
+                lights = (overcast_sky(self._up_axis),)
         lights, meshes = link_lights(self.stage, lights, meshes, report)
         scene = Scene(meshes, materials, lights, instances=geometry.instances, name=report.source)
         if self._eye is not None:
@@ -385,6 +400,7 @@ class StageReader:
                 metals=self._metals,
                 purposes=key.material_purposes,
                 links=links,
+                pixel=self._pixel,
             )
             lights = _lights(fixed.lights, time, read)
             self._rigid_shapes.clear()
@@ -422,6 +438,7 @@ class StageReader:
                     self._time_varying.purposes,
                     static.links,
                     self._times,
+                    self._pixel,
                 )
                 rigid = set() if deforms else {k for group in added.instances for k in group.meshes}
                 self._moving_triangles += sum(len(m.triangles) for k, m in enumerate(added.meshes) if k not in rigid)

@@ -31,6 +31,14 @@ class TimeVarying:
         """Purposes of material bindings, in order of preference."""
         self.layout_varies = False
         """Whether a drawable prim's transform or visibility may vary: each time then needs a new traversal."""
+        self._nothing_varies = not any(
+            attribute.ValueMightBeTimeVarying()
+            for root in (stage.GetPseudoRoot(), *stage.GetPrototypes())
+            for prim in Usd.PrimRange(root, _ALL)
+            for attribute in prim.GetAuthoredAttributes()
+        )
+        if self._nothing_varies:
+            return
         instancers = []
         for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
             for prim in Usd.PrimRange(root, _ALL):
@@ -60,7 +68,7 @@ class TimeVarying:
 
     def varies(self, prim: Usd.Prim) -> bool:
         """Whether attributes, material, transform or skinning of a gprim, camera or light may vary."""
-        return (
+        return not self._nothing_varies and (
             self._transform_varies(prim)
             or _attributes_vary(prim)
             or self._material_varies(prim)
@@ -69,7 +77,7 @@ class TimeVarying:
 
     def deforms(self, prim: Usd.Prim) -> bool:
         """Whether the geometry may vary; transform and material are not considered."""
-        return _attributes_vary(prim) or self._is_skinned(prim)
+        return not self._nothing_varies and (_attributes_vary(prim) or self._is_skinned(prim))
 
     def _transform_varies(self, prim: Usd.Prim) -> bool:
         """Whether transform, visibility or inherited primvars may vary: on the prim itself or on an ancestor."""

@@ -1,5 +1,6 @@
 """Traversal of a stage: which gprims and lights are drawn, and with which transforms, instances included."""
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
@@ -7,6 +8,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Floats
+from warp_ir.usd.geometry.curves import CURVES
 from warp_ir.usd.geometry.implicit import IMPLICIT
 from warp_ir.usd.geometry.instancing import InstanceLevel, read_instancer
 from warp_ir.usd.lights.light import LIGHTS
@@ -25,7 +27,7 @@ _METADATA_TYPES = ("HoudiniLayerInfo",)
 
 _IDENTITY = Gf.Matrix4d(1.0)
 _WORLD = InstanceLevel(Sdf.Path.absoluteRootPath, None, np.eye(4)[None])
-_GPRIM_TYPES = {"Mesh", "TetMesh", *IMPLICIT}
+_GPRIM_TYPES = {"Mesh", "TetMesh", *IMPLICIT, *CURVES, "NurbsPatch", "Points"}
 _DRAWN_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 # A prototype may be defined below an `over` or a `class`, which are not drawn themselves.
 _PROTOTYPE_PREDICATE = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -40,6 +42,8 @@ class DrawnPrim:
     """The instancing level that contains the prim; the outermost level is the world."""
     level_from_prim: Floats
     """Transform from the prim to its level, float64 [4, 4]."""
+    authored: frozenset[str]
+    """Names of the properties that the prim has opinions on; only these are read."""
     geometry_light: Usd.Prim | None = None
     """The GeometryLight whose `geometry` relationship targets this gprim; None: there is none."""
 
@@ -70,7 +74,7 @@ class _PendingPrim:
     prim: Usd.Prim
     level: InstanceLevel
     level_from_prim: Floats
-    purpose: object | None
+    purpose: UsdGeom.Imageable.PurposeInfo | None
     instancers: tuple[Sdf.Path, ...]
     origin: "_Origin"
 
@@ -141,14 +145,18 @@ class _Traversal:
             report.stats["prims_outside_pass"] += 1
             return []
         own_purpose = "default"
+        authored = frozenset(prim.GetAuthoredPropertyNames())  # one call instead of one for each that is not authored
         if prim.IsA(UsdGeom.Imageable):
             imageable = UsdGeom.Imageable(prim)
-            if read.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
-                report.stats["prims_invisible"] += 1
-                return []
-            info = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
-            own_purpose, purpose = info.purpose, info
-            level, level_from_prim = self._transformed(prim, level, level_from_prim, pending.origin)
+            if "visibility" in authored:
+                if read.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
+                    report.stats["prims_invisible"] += 1
+                    return []
+            if "purpose" in authored or purpose is None:  # else that of the parent, be it inheritable or the fallback
+                purpose = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
+            own_purpose = purpose.purpose
+            if "xformOpOrder" in authored:
+                level, level_from_prim = self._transformed(prim, level, level_from_prim, pending.origin)
         if prim.IsInstance():
             report.stats["native_instances"] += 1
             level, level_from_prim = (
@@ -158,11 +166,11 @@ class _Traversal:
         schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if not schema and prim.GetTypeName() not in ("", *_METADATA_TYPES):
             self._unknown_types[prim.GetPath()] = prim.GetTypeName()
-        if prim.HasAPI(UsdGeom.ModelAPI):
+        if "model:drawMode" in authored and prim.HasAPI(UsdGeom.ModelAPI):
             mode = read.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
             if mode not in ("inherited", "default"):
                 report.warn(prim.GetPath(), f"draw mode '{mode}' is not supported: the geometry itself is drawn")
-        drawn = DrawnPrim(prim, level, level_from_prim)
+        drawn = DrawnPrim(prim, level, level_from_prim, authored)
         if schema == "PointInstancer":
             if not self._in_render_pass(prim):
                 return []
@@ -209,13 +217,15 @@ class _Traversal:
         except Tf.ErrorException:
             self._report.warn(prim.GetPath(), "its transform cannot be read; the identity is used")
             return level, parent
+        if transform == _IDENTITY and not resets:
+            return level, parent
         matrix = np.array(transform).T
-        if not np.isfinite(matrix).all():
+        if not (math.isfinite(matrix.sum()) or np.isfinite(matrix).all()):
             self._report.warn(prim.GetPath(), "its transform is NaN or infinite; the identity is used")
             return level, parent
         if resets:
             return origin.level, self._level_from_world(origin.prototype, prim) @ matrix
-        return level, parent if transform == _IDENTITY else parent @ matrix
+        return level, parent @ matrix
 
     def _level_from_world(self, prototype: Usd.Prim | None, prim: Usd.Prim) -> Floats:
         """The transform [4, 4] from the world to the instances of a prototype, for a prim that resets its stack.
@@ -297,7 +307,11 @@ class _Traversal:
             ]
 
     def _prototypes_of(
-        self, pending: _PendingPrim, level: InstanceLevel, level_from_prim: Floats, purpose: object | None
+        self,
+        pending: _PendingPrim,
+        level: InstanceLevel,
+        level_from_prim: Floats,
+        purpose: UsdGeom.Imageable.PurposeInfo | None,
     ) -> list[_PendingPrim]:
         """The prototypes of a point instancer, each with the transforms of all its instances."""
         prim, report = pending.prim, self._report

@@ -4,8 +4,9 @@ Round shapes are surfaces of revolution: a profile of arcs (r, z) with normals, 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -18,29 +19,59 @@ from warp_ir.usd.values.triangles import TriangleMesh
 _SEGMENTS = 72
 """Segments around the axis, and half as many from pole to pole: the area of a sphere is 0.16 % too small."""
 
+_SIZES: dict[str, dict[str, float]] = {
+    "Sphere": {"radius": 1.0},
+    "Cylinder": {"radius": 1.0, "height": 2.0},
+    "Cylinder_1": {"radiusBottom": 1.0, "radiusTop": 1.0, "height": 2.0},
+    "Cone": {"radius": 1.0, "height": 2.0},
+    "Capsule": {"radius": 0.5, "height": 1.0},
+    "Capsule_1": {"radiusBottom": 0.5, "radiusTop": 0.5, "height": 1.0},
+    "Cube": {"size": 2.0},
+    "Plane": {"width": 2.0, "length": 2.0},
+}
+"""The dimensions of each schema, with the schema's fallbacks."""
+_WITH_AXIS = ("Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane")
+"""Schemas whose shape lies along an axis."""
+
 Profile = Sequence[Floats]
 """Arcs from bottom to top, outside at larger r: each float64 [p, 4] with columns r, z and the normal's r, z."""
 
 
-def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> TriangleMesh:
+def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode, authored: Container[str]) -> TriangleMesh:
     """The triangles of a Sphere, Cube, Cylinder, Cylinder_1, Cone, Capsule, Capsule_1 or Plane.
+
+    Args:
+        prim: The shape.
+        kind: Its schema.
+        time: Time at which attributes are read.
+        authored: Names of the properties that it has opinions on.
 
     Raises:
         Unreadable: A dimension is not finite, or gives a shape without area.
     """
-
-    def size(name: str, default: float) -> float:
-        dimension = read.number(prim.GetAttribute(name), time, default)
-        if dimension < 0.0:
-            raise Unreadable(f"{name} is negative ({dimension:g})")
-        return dimension
-
-    axis = read.text(prim.GetAttribute("axis"), time, "Z")
+    sizes = []
+    for name, default in _SIZES[kind].items():
+        size = read.number(prim.GetAttribute(name), time, default) if name in authored else default
+        if size < 0.0:
+            raise Unreadable(f"{name} is negative ({size:g})")
+        sizes.append(size)
+    axis = read.text(prim.GetAttribute("axis"), time, "Z") if "axis" in authored and kind in _WITH_AXIS else "Z"
     if axis not in ("X", "Y", "Z"):
         raise Unreadable(f"axis is '{axis}', not X, Y or Z")
-    shape = IMPLICIT[kind](size)
+    left_handed = False
+    if "orientation" in authored:
+        left_handed = read.text(prim.GetAttribute("orientation"), time) == UsdGeom.Tokens.leftHanded
+    shape = _tessellated(kind, tuple(sizes), axis, left_handed)
     if len(shape.triangles) == 0:
         raise Unreadable("the shape has no area")
+    return shape
+
+
+@lru_cache(maxsize=256)
+def _tessellated(kind: str, sizes: tuple[float, ...], axis: str, left_handed: bool) -> TriangleMesh:
+    """A shape by its dimensions; equal ones are the same object."""
+    dimensions = dict(zip(_SIZES[kind], sizes, strict=True))
+    shape = IMPLICIT[kind](dimensions.__getitem__)
     # Cyclic permutations of the axes map +Z to the axis and keep the handedness.
     permutation = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]
     if kind == "Plane" and axis != "Z":
@@ -49,41 +80,40 @@ def read_implicit(prim: Usd.Prim, kind: str, time: Usd.TimeCode) -> TriangleMesh
     normals = None if shape.normals is None else shape.normals[:, :, permutation]
     triangles = shape.triangles[:, ::-1] if kind == "Plane" and axis != "Z" else shape.triangles
     shape = TriangleMesh(shape.points[:, permutation], triangles, shape.face, shape.corner, normals)
-    left_handed = read.text(prim.GetAttribute("orientation"), time) == UsdGeom.Tokens.leftHanded
     return _reversed(shape) if left_handed else shape
 
 
-Size = Callable[[str, float], float]
+Size = Callable[[str], float]
 
 
 def _sphere(size: Size) -> TriangleMesh:
-    return _lathe([_arc(size("radius", 1.0), 0.0, -90.0, 90.0)])
+    return _lathe([_arc(size("radius"), 0.0, -90.0, 90.0)])
 
 
 def _cylinder(size: Size) -> TriangleMesh:
-    radius = size("radius", 1.0)
-    return _frustum(radius, radius, size("height", 2.0))
+    radius = size("radius")
+    return _frustum(radius, radius, size("height"))
 
 
 def _cylinder_1(size: Size) -> TriangleMesh:
-    return _frustum(size("radiusBottom", 1.0), size("radiusTop", 1.0), size("height", 2.0))
+    return _frustum(size("radiusBottom"), size("radiusTop"), size("height"))
 
 
 def _cone(size: Size) -> TriangleMesh:
-    return _frustum(size("radius", 1.0), 0.0, size("height", 2.0))
+    return _frustum(size("radius"), 0.0, size("height"))
 
 
 def _capsule(size: Size) -> TriangleMesh:
-    radius = size("radius", 0.5)
-    return _capped(radius, radius, size("height", 1.0))
+    radius = size("radius")
+    return _capped(radius, radius, size("height"))
 
 
 def _capsule_1(size: Size) -> TriangleMesh:
-    return _capped(size("radiusBottom", 0.5), size("radiusTop", 0.5), size("height", 1.0))
+    return _capped(size("radiusBottom"), size("radiusTop"), size("height"))
 
 
 def _cube(size: Size) -> TriangleMesh:
-    half = 0.5 * size("size", 2.0)
+    half = 0.5 * size("size")
     if half == 0.0:
         return _faceted(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     points = half * np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=np.float64)
@@ -92,7 +122,7 @@ def _cube(size: Size) -> TriangleMesh:
 
 
 def _plane(size: Size) -> TriangleMesh:
-    x, y = 0.5 * size("width", 2.0), 0.5 * size("length", 2.0)
+    x, y = 0.5 * size("width"), 0.5 * size("length")
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     if x == 0.0 or y == 0.0:
         return _faceted(corners, np.zeros((0, 3), np.int32))

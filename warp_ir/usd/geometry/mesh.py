@@ -11,7 +11,7 @@ from warp_ir.usd.geometry.refine import Scheme
 from warp_ir.usd.geometry.skinning import DeformedMesh, Skinning
 from warp_ir.usd.geometry.subdivision import cage_normals, read_subdivided
 from warp_ir.usd.geometry.triangulate import triangulate
-from warp_ir.usd.geometry.velocities import motion_after_sample
+from warp_ir.usd.geometry.velocities import read_points
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import Cells, TriangleMesh, count_elements, drop_degenerate, with_normals
@@ -37,7 +37,7 @@ def read_mesh(
         InputError: Subdivision would create too many triangles.
     """
     mesh = UsdGeom.Mesh(prim)
-    points, sampled = _points(mesh, time, report)
+    points, sampled = read_points(prim, time, report)
     counts = read.ints(mesh.GetFaceVertexCountsAttr(), time)
     indices = read.ints(mesh.GetFaceVertexIndicesAttr(), time)
     if points is None or counts is None or indices is None or len(counts) == 0:
@@ -92,7 +92,7 @@ def read_tet_mesh(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> Triangl
         Unreadable: An array has the wrong type, or indices are out of range.
     """
     tets = UsdGeom.TetMesh(prim)
-    points, sampled = _points(tets, time, report)
+    points, sampled = read_points(prim, time, report)
     faces = read.ints(tets.GetSurfaceFaceVertexIndicesAttr(), time, 3)
     cells = read.ints(tets.GetTetVertexIndicesAttr(), time, 4)
     if points is not None and cells is not None:
@@ -139,15 +139,6 @@ def _cells_of(faces: Ints, cells: Ints) -> Ints:
     return padded[found]
 
 
-def _points(prim: UsdGeom.PointBased, time: Usd.TimeCode, report: Report) -> tuple[Floats | None, bool]:
-    """The points [n, 3] of a prim, and whether they are moved by velocities (`TriangleMesh.sampled`)."""
-    attribute = prim.GetPointsAttr()
-    motion = motion_after_sample(attribute, 3, prim.GetVelocitiesAttr(), prim.GetAccelerationsAttr(), time, report)
-    if motion is None:
-        return read.floats(attribute, time, 3), False
-    return motion.start + motion.change, True
-
-
 def _check_topology(points: Floats, counts: Ints, indices: Ints) -> None:
     """Check that counts and indices describe a mesh over the points; raises `Unreadable`."""
     if counts.min() < 0:
@@ -186,18 +177,13 @@ def _with_authored_normals(
     deformed: DeformedMesh | None = None,
 ) -> TriangleMesh:
     """The shape with its authored normals, deformed like its points; without normals it stays faceted."""
-    authored = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
-    if authored and authored.HasValue():
-        attribute, interpolation = authored.GetAttr(), authored.GetInterpolation()
-        indices = read.ints(authored.GetIndicesAttr(), time) if authored.IsIndexed() else None
-    else:
-        based = UsdGeom.PointBased(prim)
-        attribute, interpolation, indices = based.GetNormalsAttr(), based.GetNormalsInterpolation(), None
+    authored = primvar.schema_primvar(prim, "normals")
     try:
-        values = read.floats(attribute, read.sample_before(attribute, time) if shape.sampled else time, 3)
+        at = read.sample_before(authored.attribute, time) if shape.sampled else time
+        values, indices = read.floats(authored.attribute, at, 3), authored.indices(time)
         if values is None or len(values) == 0 or len(shape.triangles) == 0:
             return shape
-        normals = primvar.expand(shape, values, interpolation, indices)
+        normals = primvar.expand(shape, values, authored.interpolation, indices)
     except Unreadable as error:
         report.warn(prim.GetPath(), f"normals: {error}; the mesh is faceted")
         return shape

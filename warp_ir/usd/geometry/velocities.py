@@ -7,7 +7,7 @@ motion after a sample (UsdGeomPointBased and UsdGeomPointInstancer), and the oth
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd
+from pxr import Usd, UsdGeom
 
 from warp_ir.scene import Floats
 from warp_ir.usd.values import read
@@ -64,6 +64,20 @@ def motion_after_sample(
         report.warn(attribute.GetPrim().GetPath(), f"{error}; the {attribute.GetName()} are interpolated instead")
         return None
     return Motion(start, seconds * velocity)
+
+
+def read_points(prim: Usd.Prim, time: Usd.TimeCode, report: Report) -> tuple[Floats | None, bool]:
+    """The points [n, 3] of a PointBased prim, and whether velocities move them (`TriangleMesh.sampled`).
+
+    Raises:
+        Unreadable: They are of another type.
+    """
+    based = UsdGeom.PointBased(prim)
+    attribute = based.GetPointsAttr()
+    motion = motion_after_sample(attribute, 3, based.GetVelocitiesAttr(), based.GetAccelerationsAttr(), time, report)
+    if motion is None:
+        return read.floats(attribute, time, 3), False
+    return motion.start + motion.change, True
 
 
 def _rates(attribute: Usd.Attribute, sample: float, count: int) -> Floats:

@@ -44,8 +44,8 @@ _LINEAR_NAMES = {"linear", "lin_rec709", "lin_rec709_scene", "scene_linear", "ra
 class Image:
     """A decoded image."""
 
-    pixels: npt.NDArray[np.float32]
-    """The display window, float32 [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4
+    pixels: npt.NDArray[np.floating]
+    """The display window, float [h, w, c], linear, row 0 at the top. c is 1 (grey), 2 (grey, alpha), 3 (rgb) or 4
     (rgb, alpha). It is 0 where the file holds no data."""
     width: int
     """Width of the display window; `pixels` may be averaged down."""
@@ -71,7 +71,9 @@ class Image:
         return self.pixels[..., count - 1] if count in (2, 4) else np.ones(self.pixels.shape[:2], np.float32)
 
 
-def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixels: int = MAX_PIXELS) -> Image:
+def read_texture(
+    asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixels: int = MAX_PIXELS, *, half: bool = False
+) -> Image:
     """Reads an image asset.
 
     Args:
@@ -81,6 +83,7 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
             channels unless the file's metadata names a linear space); or another colour space, whose transfer function
             is decoded and whose primaries are left. Alpha is never decoded.
         max_pixels: An image with more pixels is averaged down by an integer factor.
+        half: Whether images of 8 bits may be half floats, whose 11 bits hold them.
 
     Raises:
         Unreadable: There is no such file, it is no image, or it claims too many pixels; the message names the asset.
@@ -101,7 +104,7 @@ def read_texture(asset: Sdf.AssetPath | str, color_space: str = "auto", max_pixe
                 raise Unreadable("not found")
             if reader is None:
                 raise Unreadable(f"cannot be read: {_without_path(oiio_error(), path)}")
-            return _decode(reader, path, color_space, max_pixels)
+            return _decode(reader, path, color_space, max_pixels, half=half)
         except Unreadable as error:
             raise Unreadable(f"image '{_short(authored)}' {error}") from None
         except Exception as error:  # names and metadata of damaged files raise errors of many kinds
@@ -131,7 +134,7 @@ def _file(resolved: str) -> "Iterator[str | None]":
 
 
 @np.errstate(over="ignore", invalid="ignore")  # damaged files hold any bits
-def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: int) -> Image:
+def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: int, *, half: bool) -> Image:
     """Decodes the display window, which texture coordinates span; outside the data window it is 0."""
     import OpenImageIO as oiio
 
@@ -152,7 +155,10 @@ def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: 
     colors = 0 if decode is None else count if count in (1, 3) else count - 1
     # 8-bit values are decoded by a table of 256 entries.
     table = None if decode is None else decode(np.arange(256) / 255.0).astype(np.float32)
-    pixels = np.zeros((-(-height // factor), -(-width // factor), count), np.float32)
+    by_table = is_uint8 and factor == 1  # 8-bit values become pixels at once
+    linear = (np.arange(256) / 255.0).astype(np.float32)
+    stored_type = np.float16 if half and by_table else np.float32
+    pixels = np.zeros((-(-height // factor), -(-width // factor), count), stored_type)
     step = math.lcm(factor, int(spec.tile_height) or 1)  # a band holds whole tiles, and mostly whole rows of the result
     rows = step * max(1, _VALUES_PER_BAND // (spec.width * count * step))
     x0, x1 = max(left, spec.x), min(left + width, spec.x + spec.width)
@@ -172,11 +178,19 @@ def _decode(reader: "oiio.ImageInput", path: str, color_space: str, max_pixels: 
             raise Unreadable(f"cannot be read: {_without_path(oiio_error(reader), path)}")
         stored = np.asarray(band).reshape(below - above, spec.width, count)
         stored = stored[y0 - above : y1 - above, x0 - spec.x : x1 - spec.x]
+        if by_table:
+            target = pixels[y0 - top : y1 - top, x0 - left : x1 - left]
+            if colors:
+                assert table is not None
+                target[..., :colors] = table.astype(stored_type)[stored[..., :colors]]
+            if colors < count:
+                target[..., colors:] = linear.astype(stored_type)[stored[..., colors:]]
+            continue
         values = stored.astype(np.float32) / np.float32(255.0) if is_uint8 else stored.astype(np.float32)
         if decode is not None and table is not None:
             values[..., :colors] = table[stored[..., :colors]] if is_uint8 else decode(values[..., :colors])
         _add_means(pixels, values, (y0 - top, x0 - left), (height, width), factor)
-    if not np.isfinite(pixels).all():
+    if not by_table and not np.isfinite(pixels).all():
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
     return Image(pixels, width, height, decode is not None, _wrap_modes(spec))
 

@@ -50,7 +50,7 @@ class ImageCache:
         if key not in self._images:
             limit = max(min(MAX_PIXELS, self._pixels_left // 2), 1)
             try:
-                image = read_texture(resolved or asset, space, limit)
+                image = read_texture(resolved or asset, space, limit, half=True)
             except Unreadable as error:
                 self._images[key] = str(error)
             else:

@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from warp_ir.image.mipmap import resized
+from warp_ir.image.mipmap import resized, value_range
 from warp_ir.scene import Floats, Wrap
+from warp_ir.scene.types import pixel_mean
 
 
 @dataclass(frozen=True)
@@ -59,17 +60,17 @@ class ShadingValue:
     @cached_property
     def mean(self) -> Floats:
         """Mean over the pixels, float64 [c]."""
-        return np.asarray(self.pixels.mean(axis=(0, 1), dtype=np.float64))
+        return pixel_mean(self.pixels)
 
     @cached_property
     def lowest(self) -> float:
         """Minimum over the pixels and their channels."""
-        return float(self.pixels.min())
+        return value_range(self.pixels)[0]
 
     @cached_property
     def highest(self) -> float:
         """Maximum over the pixels and their channels."""
-        return float(self.pixels.max())
+        return value_range(self.pixels)[1]
 
     def evaluate(self, primvars: PrimvarValues) -> Floats:
         """The value on a surface with these primvars, [c] or [m, 3, c]."""
@@ -153,3 +154,30 @@ def compact(pixels: Floats) -> Floats:
     if pixels.dtype == np.float16 or np.abs(pixels).max() > 6.0e4:
         return pixels
     return pixels.astype(np.float16)
+
+
+def look_up(value: ShadingValue, uvs: Floats) -> Floats:
+    """The value at texture coordinates [..., 2], bilinearly interpolated, float64 [..., c]."""
+    if value.mapping is None:
+        return np.broadcast_to(value.mean, (*uvs.shape[:-1], len(value.mean)))
+    height, width, _ = value.pixels.shape
+    st = uvs.astype(np.float64) @ np.array(value.mapping.transform)[:, :2].T + np.array(value.mapping.transform)[:, 2]
+    neighbours, outside = [], np.zeros(st.shape[:-1], dtype=bool)
+    for axis, size in ((0, width), (1, height)):
+        x = st[..., axis] if axis == 0 else 1.0 - st[..., axis]
+        wrap = value.mapping.wrap[axis]
+        if wrap == Wrap.MIRROR:
+            x = 1.0 - np.abs(np.mod(x, 2.0) - 1.0)
+        elif wrap == Wrap.BLACK:
+            outside |= (x < 0.0) | (x > 1.0)
+        place = x * size - 0.5
+        low = np.floor(place).astype(np.int64)
+        pair = [low, low + 1]
+        pair = [np.mod(k, size) if wrap == Wrap.REPEAT else k.clip(0, size - 1) for k in pair]
+        neighbours.append((pair, (place - low)[..., None]))
+    (columns, s), (rows, t) = neighbours
+    pixels = value.pixels
+    top, bottom = ((1.0 - s) * pixels[row, columns[0]] + s * pixels[row, columns[1]] for row in rows)
+    out: Floats = (1.0 - t) * top + t * bottom
+    out[outside] = value.outside
+    return out

@@ -1,16 +1,16 @@
 """The material of each triangle, from bindings, GeomSubsets and displayColor, in one table without duplicates."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
-from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_material
+from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh
@@ -66,6 +66,7 @@ class MaterialTable:
         images: Cache of images; None: a new one.
         metals: "diffuse" or "black".
         purposes: Purposes of material bindings, in order of preference.
+        displaces: Whether displacements are read.
     """
 
     def __init__(
@@ -75,7 +76,12 @@ class MaterialTable:
         images: ImageCache | None = None,
         metals: str = "diffuse",
         purposes: Sequence[str] = PURPOSES[:2],
+        *,
+        displaces: bool = False,
     ) -> None:
+        self._displaces = displaces
+        self.displacements: dict[int, ShadingValue] = {}
+        """Displacements of materials by their index."""
         self.materials: list[Material] = []
         self._purposes = purposes
         self._time, self._report = time, report
@@ -85,6 +91,11 @@ class MaterialTable:
         self._indices: dict[Material, int] = {}
         self._index_by_path: dict[Sdf.Path, int] = {}
         self._bound_index: dict[Sdf.Path, int] = {}
+        self._with_subsets: set[Sdf.Path] = set()
+        self._color_spaces: dict[Sdf.Path, str] = {}
+        self._plain_colors: dict[tuple[bytes, str], bool] = {}
+        self._inherited: dict[tuple[Sdf.Path, str], Usd.Attribute | None] = {}
+        self._dangling: dict[Sdf.Path, Sdf.Path | None] = {}
 
     def add(self, material: Material) -> int:
         """Index of a material; equal materials share it."""
@@ -95,15 +106,94 @@ class MaterialTable:
 
     def resolve(self, prims: Sequence[Usd.Prim]) -> None:
         """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work."""
-        prims = [p for prim in prims for p in (prim, *material_subsets(prim))]
-        for prim, bound in zip(prims, bound_materials(prims, purposes_to_try(self._purposes)), strict=True):
+        gprims = []
+        for prim in prims:
+            gprims.append(prim)
+            if subsets := material_subsets(prim):
+                gprims += subsets
+                self._with_subsets.add(prim.GetPath())
+        for prim, bound in zip(gprims, bound_materials(gprims, purposes_to_try(self._purposes)), strict=True):
             if bound is not None:
                 material, purpose = bound
                 if purpose and purpose not in self._purposes:
                     self._report.warn(prim.GetPath(), f"only a material of purpose '{purpose}' is bound; it is used")
                 self._bound_index[prim.GetPath()] = self._index_of(material)
-            elif (target := _dangling_target(prim)) is not None:
+            elif (target := self._dangling_target(prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the bound material {target} does not exist")
+
+    def key(self, prim: Usd.Prim, authored: Container[str]) -> Hashable:
+        """Equal for prims to whose triangles `assign` gives the same without a warning; None: only `assign` tells.
+
+        It is quick to read: most prims of a large stage have one material, or one displayColor.
+        """
+        path = prim.GetPath()
+        if path in self._with_subsets:
+            return None
+        index = self._bound_index.get(path, UNBOUND)
+        if index != UNBOUND:
+            plain = index >= 0 and index not in self._primvar_materials and not self.materials[index].textures
+            return index if plain else None
+        if self._authored(prim, "primvars:displayOpacity", authored) is not None:
+            return None
+        color = self._authored(prim, "primvars:displayColor", authored)
+        if color is None:
+            return UNBOUND
+        values = read.raw(color, self._time)
+        if not isinstance(values, Vt.Vec3fArray) or len(values) != 1:
+            return None
+        key = bytes(memoryview(values)), self._color_space(color)
+        if key not in self._plain_colors:
+            primvar = UsdGeom.Primvar(color)
+            self._plain_colors[key] = bool(
+                primvar.GetInterpolation() == UsdGeom.Tokens.constant and all(0.0 <= x <= 1.0 for x in values[0])
+            )
+        indexed = "primvars:displayColor:indices" in authored or color.GetPrim() != prim
+        return None if indexed or not self._plain_colors[key] else key
+
+    def _authored(self, prim: Usd.Prim, name: str, authored: Container[str] | None = None) -> Usd.Attribute | None:
+        """The attribute of a prim or, cached, of its nearest ancestor that has a value for it; None: there is none."""
+        if authored is None or name in authored:
+            attribute = prim.GetAttribute(name)
+            if attribute and attribute.HasAuthoredValue():
+                return attribute
+        parent = prim.GetParent()
+        if parent.IsPseudoRoot():
+            return None
+        key = parent.GetPath(), name
+        if key not in self._inherited:
+            self._inherited[key] = self._authored(parent, name)
+        return self._inherited[key]
+
+    def _color_space(self, attribute: Usd.Attribute) -> str:
+        """`read.color_space_name`, cached by the attribute's parent."""
+        prim = attribute.GetPrim()
+        if attribute.HasColorSpace() or prim.HasAPI(Usd.ColorSpaceAPI):
+            return read.color_space_name(attribute)
+        parent = prim.GetParent().GetPath()
+        if parent not in self._color_spaces:
+            self._color_spaces[parent] = read.color_space_name(attribute)
+        return self._color_spaces[parent]
+
+    def _dangling_target(self, prim: Usd.Prim) -> Sdf.Path | None:
+        """The target of the nearest direct binding of a prim for which no material was resolved; None: there is none.
+
+        Cached by prim, since prims share their ancestors.
+        """
+        chain: list[Sdf.Path] = []
+        target: Sdf.Path | None = None
+        while prim and not prim.IsPseudoRoot():
+            path = prim.GetPath()
+            if path in self._dangling:
+                target = self._dangling[path]
+                break
+            chain.append(path)
+            binding = prim.GetRelationship("material:binding")
+            if binding and (targets := binding.GetTargets()):
+                target = targets[0]
+                break
+            prim = prim.GetParent()
+        self._dangling.update(dict.fromkeys(chain, target))
+        return target
 
     def assign(self, prim: Usd.Prim, shape: TriangleMesh) -> MaterialAssignment:
         """The materials and colours of a prim's triangles; the prim must have been passed to `resolve`."""
@@ -311,8 +401,14 @@ class MaterialTable:
         path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
         if path not in self._index_by_path:
             try:
-                evaluated = read_material(material, self._time, self._images, black_metals=self._black_metals)
+                evaluated = read_material(
+                    material, self._time, self._images, black_metals=self._black_metals, displaces=self._displaces
+                )
                 self._index_by_path[path] = TRANSPARENT if evaluated is None else self.add(evaluated.material)
+                if evaluated is not None and self._displaces:
+                    displacement = evaluated.displacement or read_displacement(material, self._time, self._images)
+                    if displacement is not None:
+                        self.displacements[self._index_by_path[path]] = displacement
                 if evaluated is not None and (evaluated.albedo or evaluated.emission or evaluated.opacity):
                     self._primvar_materials[self._index_by_path[path]] = evaluated
             except Unreadable as trouble:
@@ -335,14 +431,6 @@ def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:
 
 def _element_types(prim: Usd.Prim) -> tuple[str, ...]:
     """The elements of a prim to which materials are bound."""
-    return (UsdGeom.Tokens.face, _TETRAHEDRON) if prim.IsA(UsdGeom.TetMesh) else (UsdGeom.Tokens.face,)
-
-
-def _dangling_target(prim: Usd.Prim) -> Sdf.Path | None:
-    """The target of the nearest direct binding of a prim for which no material was resolved; None: there is none."""
-    while prim and not prim.IsPseudoRoot():
-        targets = UsdShade.MaterialBindingAPI(prim).GetDirectBindingRel().GetTargets()
-        if targets:
-            return targets[0]
-        prim = prim.GetParent()
-    return None
+    if prim.IsA(UsdGeom.TetMesh):
+        return UsdGeom.Tokens.face, _TETRAHEDRON
+    return (UsdGeom.Tokens.point,) if prim.IsA(UsdGeom.Points) else (UsdGeom.Tokens.face,)

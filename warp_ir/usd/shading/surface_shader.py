@@ -24,6 +24,8 @@ _BLACK: Color = (0.0, 0.0, 0.0)
 _WHITE: Color = (1.0, 1.0, 1.0)
 _MIN_OPACITY = 0.02
 """Opacity down to which a transparent surface emits in full: few rays hit it, and each is weighted by its inverse."""
+_DISPLACEMENT = "ND_displacement_float"
+"""MaterialX's shader of displacements along the normal."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +41,17 @@ class EvaluatedMaterial:
     """The opacity if it reads primvars; else None."""
     threshold: float = 0.0
     """If positive, surfaces of lower opacity are cut out, and others are opaque."""
+    displacement: ShadingValue | None = None
+    """Displacement along the normal, one channel; None: there is none, or it is not asked for."""
 
 
 def read_material(
-    material: UsdShade.Material, time: Usd.TimeCode, images: ImageCache, *, black_metals: bool = False
+    material: UsdShade.Material,
+    time: Usd.TimeCode,
+    images: ImageCache,
+    *,
+    black_metals: bool = False,
+    displaces: bool = False,
 ) -> EvaluatedMaterial | None:
     """Evaluates a bound material; None: its opacity is 0 everywhere.
 
@@ -51,6 +60,7 @@ def read_material(
         time: Time code of all values.
         images: Cache of images.
         black_metals: Whether metals keep only their diffuse lobe.
+        displaces: Whether the displacement is wanted; else a warning says that it is not rendered.
 
     Raises:
         Unreadable: No surface shader of the material is supported.
@@ -68,10 +78,12 @@ def read_material(
     }
     surface_paths = {shader.GetPath() for shader in shaders}
     displacements = [material.ComputeDisplacementSource(context)[0] for context in contexts]
-    if any(source and source.GetPath() not in surface_paths for source in displacements):
+    unsupported = [source for source in displacements if source and source.GetPath() not in surface_paths]
+    if any(not (displaces and source.GetShaderId() == _DISPLACEMENT) for source in unsupported):
         images.report.warn(path, "displacement is not rendered ({n} materials)")
     inputs = [
-        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), black_metals) for shader in shaders
+        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), black_metals, displaces)
+        for shader in shaders
     ]
     for shader, shader_inputs in zip(shaders, inputs, strict=True):
         read_shader = _SHADER_READERS.get(shader.GetShaderId())
@@ -97,11 +109,31 @@ def read_material(
     raise Unreadable(f"{what}; displayColor is used")
 
 
+def read_displacement(material: UsdShade.Material, time: Usd.TimeCode, images: ImageCache) -> ShadingValue | None:
+    """The displacement by MaterialX's shader of displacements, one channel; None: there is none.
+
+    Args:
+        material: The material.
+        time: Time code of all values.
+        images: Cache of images.
+    """
+    for context in ("mtlx", ""):
+        source = material.ComputeDisplacementSource(context)[0]
+        if source and source.GetShaderId() == _DISPLACEMENT:
+            inputs = _NetworkInputs(source.ConnectableAPI(), ShadingNetwork(images, material.GetPath(), time), False)
+            amount, scale = inputs.scalar("displacement", 0.0), inputs.scalar("scale", 1.0)
+            value = combine("displacement", lambda d, s: d * s, amount, scale)
+            return None if value.highest == value.lowest == 0.0 else value
+    return None
+
+
 class _NetworkInputs:
     """Evaluates the inputs of a surface shader."""
 
-    def __init__(self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, black_metals: bool) -> None:
-        self._shader, self.network, self.black_metals = shader, network, black_metals
+    def __init__(
+        self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, black_metals: bool, displaces: bool = False
+    ) -> None:
+        self._shader, self.network, self.black_metals, self.displaces = shader, network, black_metals, displaces
         self.warn = network.warn
 
     def color(self, name: str, default: Color) -> ShadingValue:
@@ -370,7 +402,12 @@ def _evaluated(
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
         inputs.warn("partial opacity lets a share of the light pass undeflected ({n} materials)")
-    inputs.warn_unrendered_input("displacement")
+    displacement: ShadingValue | None = None
+    if inputs.displaces:
+        displacement = inputs.scalar("displacement", 0.0)
+        displacement = None if displacement.highest == displacement.lowest == 0.0 else displacement
+    else:
+        inputs.warn_unrendered_input("displacement")
     network = inputs.network
     textured = opacity.mapping is not None and not opaque
     emissive_image = emission.mapping is not None and emission.highest > 0.0
@@ -389,7 +426,7 @@ def _evaluated(
         normal_texture=None if normal is None else network.texture(normal),
     )
     albedo_value, emission_value, opacity_value = (x if x.primvars else None for x in (albedo, emission, opacity))
-    return EvaluatedMaterial(material, albedo_value, emission_value, opacity_value, threshold)
+    return EvaluatedMaterial(material, albedo_value, emission_value, opacity_value, threshold, displacement)
 
 
 def _with_bounded_border(value: ShadingValue) -> ShadingValue:

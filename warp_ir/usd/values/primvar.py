@@ -1,5 +1,7 @@
 """Primvars: values per prim, face, point or face-vertex are expanded to the corners of the triangles."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
@@ -9,6 +11,34 @@ from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh
 
 _TEX_COORD_ROLE = Sdf.ValueRoleNames.TextureCoordinate
+
+
+@dataclass(frozen=True, eq=False)
+class SchemaPrimvar:
+    """An attribute of a schema that is interpolated as a primvar is: normals or widths."""
+
+    attribute: Usd.Attribute
+    interpolation: str
+    _primvar: UsdGeom.Primvar | None = None
+
+    def indices(self, time: Usd.TimeCode) -> Ints | None:
+        """Indices into its values, or None.
+
+        Raises:
+            Unreadable: They are no integers.
+        """
+        indexed = self._primvar is not None and self._primvar.IsIndexed()
+        return read.ints(self._primvar.GetIndicesAttr(), time) if self._primvar is not None and indexed else None
+
+
+def schema_primvar(prim: Usd.Prim, name: str) -> SchemaPrimvar:
+    """The primvar of a name or, without a value of it, the schema's attribute of that name."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
+    if primvar and primvar.HasValue():
+        return SchemaPrimvar(primvar.GetAttr(), primvar.GetInterpolation(), primvar)
+    attribute = prim.GetAttribute(name)
+    interpolation = attribute.GetMetadata("interpolation") if attribute else None
+    return SchemaPrimvar(attribute, str(interpolation or UsdGeom.Tokens.vertex))
 
 
 def expand(mesh: TriangleMesh, values: Floats, interpolation: str, indices: Ints | None = None) -> Floats:
