@@ -129,5 +129,5 @@ def test_a_picture_too_large_for_the_memory_is_refused(monkeypatch):
     from warp_ir.device.launcher import Launcher
 
     monkeypatch.setattr(Launcher, "memory", lambda self: 2.0**30)
-    with pytest.raises(ir.InputError, match=r"4000 x 4000 pixels need about 4.4 GiB, cpu has 1.0 GiB"):
+    with pytest.raises(ir.InputError, match=r"4000 x 4000 pixels need about 4.5 GiB, cpu has 1.0 GiB"):
         ir.render(ir.Scene(), ir.RenderSettings(width=4000, height=4000))

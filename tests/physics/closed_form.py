@@ -3,16 +3,19 @@
 import numpy as np
 
 import warp_ir as ir
+from warp_ir.renderer import Renderer
 from warp_ir.scene import LightKind
+from warp_ir.settings import GuidingSettings
 
 ITERATIONS = {"vpl": 64, "keller": 16, "path": 512}
 """Enough of each estimator for a standard error of about a percent in the scenes of these tests."""
 
 
-def render(scene, estimator, device="cpu", **settings):
-    """A small, unfiltered picture."""
+def render(scene, estimator, device="cpu", guiding=None, **settings):
+    """A small, unfiltered picture; `guiding` is that of `Renderer`, by default its own."""
     defaults = dict(width=8, height=8, iterations=ITERATIONS[estimator], light_paths=256, filter=False)
-    return ir.render(scene, ir.RenderSettings(estimator=estimator, **(defaults | settings)), device=device)
+    settings = ir.RenderSettings(estimator=estimator, **(defaults | settings))
+    return Renderer(scene, settings, device=device, guiding=guiding or GuidingSettings()).render()
 
 
 def assert_mean(film, expected, *, bias=0.0, sigmas=5.0):

@@ -476,7 +476,11 @@ def _check_part(part: Part | None, film: Path, *, resume: bool) -> None:
     from warp_ir.film import read_state
 
     try:
-        other = read_part(film).part if read_state(film).note else None
+        note = read_state(film).note
+    except InputError:
+        return  # it is damaged, and replaced; or `Checkpoint.resume` refuses it
+    try:
+        other = read_part(film).part if note else None
     except InputError:
         if resume:
             raise

@@ -14,6 +14,7 @@ The bound follows from the density of the VPLs (`vpl.sets`): no length in scene 
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import ClassVar
 
@@ -184,7 +185,9 @@ class VplEstimator:
         scramble = sobol.iteration_scramble(self._settings.seed, iteration)
         self._scramble = self._scratch.number("scramble", scramble, wp.uint32)
         self._iteration = self._scratch.number("iteration", iteration, wp.int32)
-        return self._guide_of(iteration)
+        guide = self._guide_of(iteration)
+        # An iteration whose VPLs are at hand launches less than others: another record says that it is not like them.
+        return replace(guide) if iteration == self._at_hand[0] else guide
 
     def _vpls_of(self, iteration: int, guide: Guide) -> "wp.array[VplSets]":
         """The VPLs of an iteration, arranged in sets."""
