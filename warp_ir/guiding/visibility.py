@@ -195,7 +195,7 @@ def _learn_kind(probed: ProbedTiles, kind: int, column: int, row: int, factors: 
     return light[0] * wp.sqrt(visible * (1.0 - visible) + _OTHER_VARIANCE * visible)
 
 
-@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)
+@wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=128)  # counts of sections may lie in local memory
 def _learn_tiles(first: int, probed: ProbedTiles, learned: TileVisibility) -> None:
     """Learns from the rays of a tile and of those around it."""
     i = first + wp.tid()
