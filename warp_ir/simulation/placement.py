@@ -91,6 +91,24 @@ def move_instance(placements: Placements, changed: wp.array[wp.int32], i: int, p
         changed[placements.group[i]] = 1
 
 
+@wp.func
+def color_instance(
+    placements: Placements, colors: wp.array[wp.vec3], changed: wp.array[wp.int32], i: int, color: wp.vec3
+) -> None:
+    """Colours an instance; marks its world as changed if it had another colour."""
+    if not (colors[i] == color):
+        colors[i] = color
+        changed[placements.group[i]] = 1
+
+
+@wp.func
+def _selected(rows: wp.array[wp.int32], k: int) -> int:
+    """The k-th of the selected rows; no rows are all of them in order."""
+    if rows.shape[0] > 0:
+        return rows[k]
+    return k
+
+
 @wp.kernel
 def _move_instances(
     first: int,
@@ -99,12 +117,9 @@ def _move_instances(
     placements: Placements,
     changed: wp.array[wp.int32],
 ) -> None:
-    """Moves an instance; no rows are all of them in order."""
+    """Moves a selected instance."""
     k = first + wp.tid()
-    i = k
-    if rows.shape[0] > 0:
-        i = rows[k]
-    move_instance(placements, changed, i, poses[k])
+    move_instance(placements, changed, _selected(rows, k), poses[k])
 
 
 @wp.kernel
@@ -116,14 +131,9 @@ def _color_instances(
     colors: wp.array[wp.vec3],
     changed: wp.array[wp.int32],
 ) -> None:
-    """Colours an instance."""
+    """Colours a selected instance."""
     k = first + wp.tid()
-    i = k
-    if rows.shape[0] > 0:
-        i = rows[k]
-    if not (colors[i] == source[k]):
-        colors[i] = source[k]
-        changed[placements.group[i]] = 1
+    color_instance(placements, colors, changed, _selected(rows, k), source[k])
 
 
 @wp.struct
@@ -148,9 +158,7 @@ def _set_points(
 ) -> None:
     """Writes a point in its prototype's own frame, the origin if it is not finite; a selection lists the sources."""
     k = first + wp.tid()
-    i = k
-    if selection.shape[0] > 0:
-        i = selection[k]
+    i = _selected(selection, k)
     row = moving.rows[begin + k]
     prototype = moving.prototype[begin + k]
     p = (source[i] - prototypes.origin[prototype]) * prototypes.scale[prototype]
