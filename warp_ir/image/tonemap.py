@@ -24,6 +24,12 @@ def srgb_from_linear(linear: Array) -> Array:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
 
+def srgb_to_linear(values: Array) -> Array:
+    """The inverse of sRGB's transfer function, continued above 1."""
+    low = values <= 0.04045
+    return np.where(low, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
 def filmic(linear: Array) -> Array:
     """Fit of the ACES filmic tone curve by Narkowicz (2015, "ACES Filmic Tone Mapping Curve"); linear, in [0, 1].
 

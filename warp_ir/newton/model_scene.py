@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warp_ir.image.tonemap import srgb_to_linear
 from warp_ir.newton import shapes
 from warp_ir.scene import Floats, InputError, Instances, Ints, Material, Mesh, Scene, Texture
 
@@ -58,12 +59,6 @@ def _copy_mesh(first: int, mesh: wp.uint64, points: wp.array[wp.vec3], indices: 
         points[i] = wp.mesh_get(mesh).points[i]
     if i < indices.shape[0]:
         indices[i] = wp.mesh_get(mesh).indices[i]
-
-
-def srgb_to_linear(values: Any) -> Floats:
-    """Linear values of sRGB ones, in [0, 1]."""
-    v = np.asarray(values, np.float64).clip(0.0, 1.0)
-    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
 
 def model_scene(
@@ -192,7 +187,7 @@ class _Builder:
         worlds = model.particle_world.numpy()[triangles[:, 0]]
         colors = np.ones((len(triangles), 3))
         if model.tri_color is not None and model.tri_color.shape[0] == model.tri_count:
-            colors = srgb_to_linear(model.tri_color.numpy())
+            colors = srgb_to_linear(model.tri_color.numpy().astype(np.float64).clip(0.0, 1.0))
         points = model.particle_q.numpy().astype(np.float64)
         for world in np.unique(worlds).tolist():
             if world >= 0 or shared:

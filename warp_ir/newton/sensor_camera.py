@@ -25,7 +25,8 @@ from warp_ir.device_scene import DeviceFrame
 from warp_ir.newton.model_scene import ModelScene, check_model, model_scene
 from warp_ir.scene import Floats, InputError, Light, LightKind
 from warp_ir.simulation import ClearValues, LiveScene, Views, ViewSettings
-from warp_ir.simulation.placement import Placements, move_instance
+from warp_ir.simulation.images import from_srgb
+from warp_ir.simulation.placement import Placements, color_instance, move_instance
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -56,14 +57,6 @@ class GiSettings:
     None: that of the bodies. What is infinite does not count."""
     lights: Sequence[Light] = ()
     """More lights, in all worlds."""
-
-
-@wp.func
-def _to_linear(v: float) -> float:
-    x = wp.clamp(v, 0.0, 1.0)
-    if x <= 0.04045:
-        return x / 12.92
-    return wp.pow((x + 0.055) / 1.055, 2.4)
 
 
 @wp.kernel
@@ -112,10 +105,10 @@ def _color_shapes(
     """Colours the instance of a shape by its sRGB colour."""
     i = first + wp.tid()
     c = shape_color[shapes[i]]
-    linear = wp.vec3(_to_linear(c[0]), _to_linear(c[1]), _to_linear(c[2]))
-    if not (colors[i] == linear):
-        colors[i] = linear
-        changed[placements.group[i]] = 1
+    linear = wp.vec3()
+    for k in range(3):
+        linear[k] = from_srgb(wp.clamp(c[k], 0.0, 1.0))
+    color_instance(placements, colors, changed, i, linear)
 
 
 class SensorCamera:

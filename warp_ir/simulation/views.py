@@ -24,6 +24,7 @@ from warp_ir.device.scratch import Scratch
 from warp_ir.estimators.vpl import COMPENSATION_SHADOW_RAYS, SHADOW_RAYS
 from warp_ir.estimators.wavefront import GatherSettings
 from warp_ir.gbuffer import new_gbuffer
+from warp_ir.image.tonemap import srgb_to_linear
 from warp_ir.reconstruction.filter import LEVELS, SIGMA_DECAY, SIGMAS, IrradianceLayer, new_layer
 from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
 from warp_ir.scene import InputError
@@ -525,7 +526,6 @@ def _to_linear(packed: int) -> int:
     """A packed sRGB colour as a packed linear one; alpha stays."""
     out = packed & 0xFF000000
     for shift in (0, 8, 16):
-        v = (packed >> shift & 0xFF) / 255.0
-        linear = v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
+        linear = srgb_to_linear(np.array((packed >> shift & 0xFF) / 255.0))
         out |= int(linear * 255.0) << shift
     return out

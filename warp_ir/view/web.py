@@ -11,7 +11,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from warp_ir.image.tonemap import TONEMAPS
+import numpy as np
+
+from warp_ir.image.tonemap import TONEMAPS, srgb_from_linear, srgb_to_linear
 from warp_ir.scene import InputError
 from warp_ir.settings import ESTIMATOR_NAMES
 from warp_ir.view.controls import Controls
@@ -215,7 +217,7 @@ class ViewServer:
         elif name == "time" and view.source.frames is not None and float(value) != self._time():
             view.change(time=float(value))
         elif name == "color" and controls.surface and len(value) == 7 and value != _hex(controls.color):
-            red, green, blue = (_linear(int(value[k : k + 2], 16) / 255.0) for k in (1, 3, 5))
+            red, green, blue = srgb_to_linear(np.array([int(value[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0).tolist()
             controls.paint((red, green, blue))
 
     def _time(self) -> float:
@@ -318,12 +320,7 @@ def _stops(gain: float) -> float:
 
 def _hex(color: tuple[float, float, float]) -> str:
     """A linear colour as the page's field shows it."""
-    encoded = (12.92 * x if x <= 0.0031308 else 1.055 * x ** (1.0 / 2.4) - 0.055 for x in color)
-    return "#" + "".join(f"{round(255.0 * min(max(x, 0.0), 1.0)):02x}" for x in encoded)
-
-
-def _linear(x: float) -> float:
-    return x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4
+    return "#" + "".join(f"{round(255.0 * x):02x}" for x in srgb_from_linear(np.array(color)).tolist())
 
 
 def serve_view(

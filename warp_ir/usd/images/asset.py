@@ -19,10 +19,11 @@ from pxr import Ar, Sdf
 
 from warp_ir.files import first_line
 from warp_ir.image.io import oiio_error
+from warp_ir.image.tonemap import srgb_to_linear
 from warp_ir.scene import Floats
 from warp_ir.usd.values import source_color_space
 from warp_ir.usd.values.report import Unreadable
-from warp_ir.usd.values.source_color_space import decoder, srgb_to_linear
+from warp_ir.usd.values.source_color_space import decoder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

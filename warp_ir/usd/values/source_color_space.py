@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Gf
 
 from warp_ir.image.ocio import OcioConfig, active_config
+from warp_ir.image.tonemap import srgb_to_linear
 from warp_ir.scene import Floats, InputError
 from warp_ir.usd.values.report import Unreadable
 
@@ -117,12 +118,6 @@ def decoder(space: Space) -> Callable[[Floats], Floats] | None:
     if bias == 0.0:
         return lambda values: np.maximum(values, 0.0) ** gamma
     return srgb_to_linear
-
-
-def srgb_to_linear(values: Floats) -> Floats:
-    """The inverse of sRGB's transfer function (IEC 61966-2-1), continued above 1."""
-    low = values <= 0.04045
-    return np.where(low, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def space_name(space: Space) -> str:
