@@ -15,17 +15,9 @@ from warp_ir.device.launcher import Launcher
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
-@wp.kernel
-def _refit_blocks(
-    first: int,
-    first_block: int,
-    row_offset: int,
-    points: wp.array[wp.vec3],
-    indices: wp.array[wp.int32],
-    bvh: Bvh,
-) -> None:
+@wp.func
+def refit_block(bvh: Bvh, block: int, row_offset: int, points: wp.array[wp.vec3], indices: wp.array[wp.int32]) -> None:
     """Reads the corners of a block's triangles again; a triangle's number plus `row_offset` is its row in `indices`."""
-    block = first_block + first + wp.tid()
     for lane in range(8):
         triangle = bvh.triangles[block][lane]
         if triangle >= 0:
@@ -35,30 +27,63 @@ def _refit_blocks(
                     bvh.blocks[9 * block + 3 * corner + axis][lane] = p[axis]
 
 
+@wp.func
+def is_used(bvh: Bvh, node: int, k: int) -> bool:
+    """Whether a node has a k-th child: the box of an unused lane is inverted, its lower corner above the upper one."""
+    return bvh.nodes[6 * node][k] <= bvh.nodes[6 * node + 3][k]
+
+
+@wp.func
+def refit_leaf_box(bvh: Bvh, node: int, k: int) -> None:
+    """Recomputes the box of a node's k-th child, which is a leaf."""
+    lower = wp.vec3(INFINITY)
+    upper = wp.vec3(-INFINITY)
+    block = ~bvh.children[node][k]
+    continues = int(1)
+    while continues == 1:
+        for lane in range(8):
+            if bvh.triangles[block][lane] >= 0:
+                for corner in range(3):
+                    base = 9 * block + 3 * corner
+                    p = wp.vec3(bvh.blocks[base][lane], bvh.blocks[base + 1][lane], bvh.blocks[base + 2][lane])
+                    lower = wp.min(lower, p)
+                    upper = wp.max(upper, p)
+        continues = bvh.continues[block]
+        block += 1
+    for axis in range(3):
+        bvh.nodes[6 * node + axis][k] = lower[axis]
+        bvh.nodes[6 * node + 3 + axis][k] = upper[axis]
+
+
+@wp.func
+def refit_inner_box(bvh: Bvh, node: int, k: int) -> None:
+    """Recomputes the box of a node's k-th child, an inner node whose boxes are up to date."""
+    child = bvh.children[node][k]
+    for axis in range(3):
+        bvh.nodes[6 * node + axis][k] = wp.min(bvh.nodes[6 * child + axis])
+        bvh.nodes[6 * node + 3 + axis][k] = wp.max(bvh.nodes[6 * child + 3 + axis])
+
+
+@wp.kernel
+def _refit_blocks(
+    first: int,
+    first_block: int,
+    row_offset: int,
+    points: wp.array[wp.vec3],
+    indices: wp.array[wp.int32],
+    bvh: Bvh,
+) -> None:
+    """Reads the corners of a block's triangles again."""
+    refit_block(bvh, first_block + first + wp.tid(), row_offset, points, indices)
+
+
 @wp.kernel
 def _refit_leaf_boxes(first: int, first_node: int, bvh: Bvh) -> None:
     """Recomputes the boxes of those children of a node that are leaves."""
     node = first_node + first + wp.tid()
     for k in range(8):
-        # The box of an unused lane is inverted: its lower corner is above the upper one.
-        if bvh.children[node][k] < 0 and bvh.nodes[6 * node][k] <= bvh.nodes[6 * node + 3][k]:
-            lower = wp.vec3(INFINITY)
-            upper = wp.vec3(-INFINITY)
-            block = ~bvh.children[node][k]
-            continues = int(1)
-            while continues == 1:
-                for lane in range(8):
-                    if bvh.triangles[block][lane] >= 0:
-                        for corner in range(3):
-                            base = 9 * block + 3 * corner
-                            p = wp.vec3(bvh.blocks[base][lane], bvh.blocks[base + 1][lane], bvh.blocks[base + 2][lane])
-                            lower = wp.min(lower, p)
-                            upper = wp.max(upper, p)
-                continues = bvh.continues[block]
-                block += 1
-            for axis in range(3):
-                bvh.nodes[6 * node + axis][k] = lower[axis]
-                bvh.nodes[6 * node + 3 + axis][k] = upper[axis]
+        if bvh.children[node][k] < 0 and is_used(bvh, node, k):
+            refit_leaf_box(bvh, node, k)
 
 
 @wp.kernel
@@ -67,11 +92,8 @@ def _refit_inner_boxes(first: int, first_node: int, count: int, bvh: Bvh) -> Non
     for i in range(count):
         node = first_node + count - 1 - i
         for k in range(8):
-            child = bvh.children[node][k]
-            if child >= 0 and bvh.nodes[6 * node][k] <= bvh.nodes[6 * node + 3][k]:
-                for axis in range(3):
-                    bvh.nodes[6 * node + axis][k] = wp.min(bvh.nodes[6 * child + axis])
-                    bvh.nodes[6 * node + 3 + axis][k] = wp.max(bvh.nodes[6 * child + 3 + axis])
+            if bvh.children[node][k] >= 0 and is_used(bvh, node, k):
+                refit_inner_box(bvh, node, k)
 
 
 @wp.kernel

@@ -3,9 +3,11 @@
 import warp as wp
 
 from warp_ir.bvh import Bvh, Instance, on_cuda
+from warp_ir.bvh.refit import is_used, refit_block, refit_inner_box, refit_leaf_box
 from warp_ir.bvh.warp_bvh import box_corner, root_node, tree_of_mesh
 from warp_ir.device_scene import SceneData
 from warp_ir.simulation.top_tree import KEY_BITS
+from warp_ir.vpl.sets import morton_code
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -13,6 +15,7 @@ _INFINITY = wp.constant(3.0e38)
 _MARGIN = wp.constant(16.0 * 2.0**-23)
 _LAST_KEY = wp.constant((1 << (KEY_BITS - 1)) | ((1 << 30) - 1))
 _LARGE = wp.constant(1 << 30)
+_CODE_CELLS = wp.constant(1024)
 
 
 @wp.struct
@@ -196,21 +199,9 @@ def _bake_points(
 
 
 @wp.func
-def _spread_bits(x: int) -> int:
-    """The lowest ten bits of x, with two zeros after each."""
-    y = (x | (x << 16)) & 0x30000FF
-    y = (y | (y << 8)) & 0x300F00F
-    y = (y | (y << 4)) & 0x30C30C3
-    return (y | (y << 2)) & 0x9249249
-
-
-@wp.func
 def _key(lower: wp.vec3, upper: wp.vec3, focus: wp.vec3, radius: float) -> int:
     """The place of a box on a Z-order curve around a ball; large boxes come after all small ones."""
-    code = int(0)
-    centre = (0.5 * (lower + upper) - focus) / (4.0 * radius)
-    for k in range(3):
-        code = code | (_spread_bits(wp.clamp(int((centre[k] + 0.5) * 1024.0), 0, 1023)) << k)
+    code = morton_code((0.5 * (lower + upper) - focus) / (4.0 * radius), _CODE_CELLS)
     if wp.length(upper - lower) > radius:
         code = code | _LARGE
     return code
@@ -300,13 +291,7 @@ def _refit_block_list(
 ) -> None:
     """Reads the corners of a block's triangles again; a block, and what to add to its triangles to get their rows."""
     block = blocks[first + wp.tid()]
-    for lane in range(8):
-        triangle = bvh.triangles[block[0]][lane]
-        if triangle >= 0:
-            for corner in range(3):
-                p = points[indices[3 * (triangle + block[1]) + corner]]
-                for axis in range(3):
-                    bvh.blocks[9 * block[0] + 3 * corner + axis][lane] = p[axis]
+    refit_block(bvh, block[0], block[1], points, indices)
 
 
 @wp.kernel
@@ -314,32 +299,11 @@ def _refit_node_list(first: int, nodes: wp.array[wp.int32], bvh: Bvh) -> None:
     """Recomputes the boxes of a node's children, which are leaves, or nodes that are done."""
     node = nodes[first + wp.tid()]
     for k in range(8):
-        if bvh.nodes[6 * node][k] <= bvh.nodes[6 * node + 3][k]:
-            lower = wp.vec3(_INFINITY)
-            upper = wp.vec3(-_INFINITY)
-            child = bvh.children[node][k]
-            if child >= 0:
-                for axis in range(3):
-                    lower[axis] = wp.min(bvh.nodes[6 * child + axis])
-                    upper[axis] = wp.max(bvh.nodes[6 * child + 3 + axis])
+        if is_used(bvh, node, k):
+            if bvh.children[node][k] >= 0:
+                refit_inner_box(bvh, node, k)
             else:
-                block = ~child
-                continues = int(1)
-                while continues == 1:
-                    for lane in range(8):
-                        if bvh.triangles[block][lane] >= 0:
-                            for corner in range(3):
-                                base = 9 * block + 3 * corner
-                                p = wp.vec3(
-                                    bvh.blocks[base][lane], bvh.blocks[base + 1][lane], bvh.blocks[base + 2][lane]
-                                )
-                                lower = wp.min(lower, p)
-                                upper = wp.max(upper, p)
-                    continues = bvh.continues[block]
-                    block += 1
-            for axis in range(3):
-                bvh.nodes[6 * node + axis][k] = lower[axis]
-                bvh.nodes[6 * node + 3 + axis][k] = upper[axis]
+                refit_leaf_box(bvh, node, k)
 
 
 @wp.struct

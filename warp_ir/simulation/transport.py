@@ -21,6 +21,8 @@ from warp_ir.vpl.emission import (
     LightPathSettings,
     VplBuffer,
     copy_vpl,
+    recorded_vpls,
+    remaining_vpls,
     surface_row,
     thinning_weight,
     trace_light_path,
@@ -35,7 +37,7 @@ from warp_ir.vpl.sets import (
     pack_block,
     pack_shaping,
     pack_slot,
-    spread_bits,
+    sort_key,
 )
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -169,6 +171,13 @@ def _scramble_slots(first: int, paths: WorldPaths) -> None:
     paths.scramble[slot, 0] = sobol.hash_combine(bits, wp.uint32(world))
 
 
+@wp.func
+def _vpls_of_slot(paths: WorldPaths, ends: wp.array[wp.int32], slot: int) -> wp.vec2i:
+    """How many VPLs on surfaces the paths of earlier slots leave, and those of a slot."""
+    before = wp.where(slot == 0, 0, ends[wp.max(slot * paths.paths - 1, 0)])
+    return wp.vec2i(before, ends[(slot + 1) * paths.paths - 1] - before)
+
+
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_world_paths(
     first: int,
@@ -185,25 +194,15 @@ def _trace_world_paths(
     world = world_in(paths, slot)
     settings = _settings_of(paths, slot, world)
     length = int(0)
-    number = path
-    stride = settings.paths
-    total = int(0)
-    skip = int(0)
-    end = settings.recorded
+    written = recorded_vpls(settings, path)
     if settings.again == 1:
         if lengths[i] <= settings.recorded:
             return
-        before = wp.where(slot == 0, 0, ends[wp.max(slot * paths.paths - 1, 0)])
-        number = ends[i] - lengths[i] - before
-        stride = 1
-        total = ends[(slot + 1) * paths.paths - 1] - before
-        skip = settings.recorded
-        end = lengths[i]
+        counts = _vpls_of_slot(paths, ends, slot)
+        written = remaining_vpls(settings, lengths[i], ends[i] - lengths[i] - counts[0], counts[1])
     if world >= 0:
         if worlds[world].emitter_count > 0:
-            length = trace_light_path(
-                worlds[world].address, settings, path, buffers[slot], number, stride, total, skip, end
-            )
+            length = trace_light_path(worlds[world].address, settings, path, buffers[slot], written)
         elif path < settings.on_lights:
             buffer = buffers[slot]
             buffer.position[path] = wp.vec4(0.0)
@@ -234,15 +233,15 @@ def _store_world_paths(
     world = world_in(paths, slot)
     settings = paths.settings
     settings.scramble = paths.scramble[slot]
-    before = wp.where(slot == 0, 0, ends[wp.max(slot * paths.paths - 1, 0)])
-    total = ends[(slot + 1) * paths.paths - 1] - before
+    counts = _vpls_of_slot(paths, ends, slot)
+    total = counts[1]
     if path == 0:
         buffers[slot].count[0] = wp.where(world < 0, 0, settings.on_lights + wp.min(total, settings.capacity))
     if world < 0:
         return
     source = traced[slot]
     buffer = buffers[slot]
-    number = ends[i] - lengths[i] - before
+    number = ends[i] - lengths[i] - counts[0]
     for k in range(wp.min(lengths[i], settings.recorded)):
         row = surface_row(settings, number + k, total)
         if row >= 0:
@@ -278,9 +277,8 @@ def _divide_worlds(
     of_lights = divide_blocks(on_lights, max_sets)
     of_surfaces = divide_blocks(count - on_lights, max_sets)
     if i == 0:
-        evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
         area = wp.float64(paths.areas[wp.max(world, 0)])
-        bound = bound_on_geometry(evaluated, _LANES * of_lights[1], wp.float64(1.0), area)
+        bound = bound_on_geometry(of_lights, of_surfaces, wp.float64(1.0), area)
         vpl_sets[slot, ON_LIGHTS].sets = of_lights[0]
         vpl_sets[slot, ON_LIGHTS].blocks = of_lights[1]
         vpl_sets[slot, ON_LIGHTS].count = on_lights
@@ -292,15 +290,8 @@ def _divide_worlds(
     key = int(_LAST)
     if i < count:
         p = vpls.position[i]
-        focus = worlds[world].focus
-        code = int(0)
-        for axis in range(3):
-            place = (p[axis] - focus[axis] * p[3]) / (2.0 * worlds[world].focus_radius)
-            code = code | (spread_bits(wp.clamp(int((place + 0.5) * 64.0), 0, 63)) << axis)
-        if i < on_lights:
-            key = code | ((i // (of_lights[1] * _LANES)) << 18)
-        else:
-            key = code | (((i - on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 30)
+        place = wp.vec3(p[0], p[1], p[2]) - worlds[world].focus * p[3]
+        key = sort_key(place / (2.0 * worlds[world].focus_radius), i, on_lights, of_lights, of_surfaces)
     order[k] = i
     keys[k] = (wp.int64(slot) << wp.int64(KEY_BITS)) | wp.int64(key)
 

@@ -208,29 +208,56 @@ def _trace_segment(
     return out
 
 
+@wp.struct
+class WrittenVpls:
+    """Which of the n VPLs that a light path leaves on surfaces are written: skip + 1 ... min(end, n).
+
+    The j-th is number first + (j - 1) stride of `total`, from which `surface_row` gives its row.
+    """
+
+    skip: int
+    end: int
+    first: int
+    stride: int
+    total: int
+
+
+@wp.func
+def recorded_vpls(settings: LightPathSettings, path: int) -> WrittenVpls:
+    """The first VPLs of a path, which are recorded before the lengths of all paths are known."""
+    out = WrittenVpls()
+    out.end = settings.recorded
+    out.first = path
+    out.stride = settings.paths
+    return out
+
+
+@wp.func
+def remaining_vpls(settings: LightPathSettings, length: int, first: int, total: int) -> WrittenVpls:
+    """The other VPLs of a path that leaves `length`, the first of which is number `first` of `total`."""
+    out = WrittenVpls()
+    out.skip = settings.recorded
+    out.end = length
+    out.first = first
+    out.stride = 1
+    out.total = total
+    return out
+
+
 @wp.func(inline=False)
 def trace_light_path(
-    address: wp.uint64,
-    settings: LightPathSettings,
-    i: int,
-    vpls: VplBuffer,
-    first_number: int,
-    number_stride: int,
-    total: int,
-    skip: int,
-    end: int,
+    address: wp.uint64, settings: LightPathSettings, i: int, vpls: VplBuffer, written: WrittenVpls
 ) -> int:
-    """Traces light path `i`, and returns the number n of VPLs that it leaves on surfaces.
+    """Traces light path `i`, and returns the number of VPLs that it leaves on surfaces; some are written to `vpls`.
 
-    The VPLs skip + 1 ... min(end, n) are written to `vpls`. The j-th is number first_number + (j - 1) number_stride of
-    `total`, from which `surface_row` gives its row. With skip = 0 the point on the light is written to row i.
+    Where none is skipped, the point on the light is written to row i.
     """
     scene = scene_at(address)[0]
     u_pick = sobol.sample_1d(scene.sobol, i, 2, settings.scramble[0])
     u = sobol.sample_2d(scene.sobol, i, 0, settings.scramble[0])
     light = sample_light(scene, u_pick, u)
     path_weight = 1.0 / float(settings.paths)
-    if skip == 0 and i < settings.on_lights:
+    if written.skip == 0 and i < settings.on_lights:
         vpls.position[i] = light.position
         vpls.normal[i] = light.normal
         vpls.intensity[i] = light.intensity / float(settings.on_lights)
@@ -284,12 +311,12 @@ def trace_light_path(
             survives = _survival_sample(settings.scramble[0], i, bounce) < probability
         if survives:
             vpl_count += 1
-            if vpl_count > skip and vpl_count <= end:
-                row = surface_row(settings, first_number + (vpl_count - 1) * number_stride, total)
+            if vpl_count > written.skip and vpl_count <= written.end:
+                row = surface_row(settings, written.first + (vpl_count - 1) * written.stride, written.total)
                 if row >= 0:
                     vpls.position[row] = wp.vec4(hit.position[0], hit.position[1], hit.position[2], 1.0)
                     vpls.normal[row] = wp.vec4(hit.normal[0], hit.normal[1], hit.normal[2], 0.0)
-                    vpls.intensity[row] = intensity * thinning_weight(settings, total)
+                    vpls.intensity[row] = intensity * thinning_weight(settings, written.total)
                     vpls.bounce[row] = bounce
                     if scene.uneven == 1:
                         vpls.lift[row] = scene.emitter_lift[light.emitter]
@@ -314,20 +341,12 @@ def _trace_light_paths(
     those that have more VPLs store them after those of the paths before them, which `ends` counts.
     """
     i = first + wp.tid()
-    number = i
-    stride = settings.paths
-    total = int(0)
-    skip = int(0)
-    end = settings.recorded
+    written = recorded_vpls(settings, i)
     if settings.again == 1:
         if lengths[i] <= settings.recorded:
             return
-        number = ends[i] - lengths[i]
-        stride = 1
-        total = ends[settings.paths - 1]
-        skip = settings.recorded
-        end = lengths[i]
-    length = trace_light_path(scene.address, settings, i, vpls, number, stride, total, skip, end)
+        written = remaining_vpls(settings, lengths[i], ends[i] - lengths[i], ends[settings.paths - 1])
+    length = trace_light_path(scene.address, settings, i, vpls, written)
     if settings.again == 0:
         lengths[i] = length
 

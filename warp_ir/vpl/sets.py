@@ -33,6 +33,7 @@ SLOT_ROWS = wp.constant(3)
 SLOT_SHAPING_ROWS = wp.constant(2)
 _PI = wp.constant(wp.float64(math.pi))
 UNBOUNDED = wp.constant(3.0e38)
+_CODE_CELLS = wp.constant(64)
 _LAST = wp.constant(2**31 - 1)
 """Sort key of an empty row."""
 _BOUND_AREAS = wp.constant(wp.float64(20.0))
@@ -101,11 +102,36 @@ def intensity_and_bounce(group: VplSets, slot: int) -> wp.vec4:
 
 
 @wp.func
-def spread_bits(x: int) -> int:
-    """The lowest six bits of x, with two zeros after each: one coordinate of a Morton code."""
-    y = (x | (x << 8)) & 0x0F00F
-    y = (y | (y << 4)) & 0x0C30C3
-    return (y | (y << 2)) & 0x249249
+def _spread_bits(x: int) -> int:
+    """The lowest ten bits of x, with two zeros after each: one coordinate of a Morton code."""
+    y = (x | (x << 16)) & 0x30000FF
+    y = (y | (y << 8)) & 0x300F00F
+    y = (y | (y << 4)) & 0x30C30C3
+    return (y | (y << 2)) & 0x9249249
+
+
+@wp.func
+def morton_code(place: wp.vec3, cells: int) -> int:
+    """The place on a Z-order curve through [-1/2, 1/2]³, of `cells`³ cells (a power of two, at most 1024).
+
+    What lies outside is moved to the nearest cell.
+    """
+    code = int(0)
+    for k in range(3):
+        code = code | (_spread_bits(wp.clamp(int((place[k] + 0.5) * float(cells)), 0, cells - 1)) << k)
+    return code
+
+
+@wp.func
+def sort_key(place: wp.vec3, i: int, on_lights: int, of_lights: wp.vec2i, of_surfaces: wp.vec2i) -> int:
+    """The sort key of VPL `i`: light or surface, then the set, then the Morton code.
+
+    `place` is in [-1/2, 1/2]³ where VPLs are told apart; `of_lights` and `of_surfaces` are those of `divide_blocks`.
+    """
+    code = morton_code(place, _CODE_CELLS)
+    if i < on_lights:
+        return code | ((i // (of_lights[1] * _LANES)) << 18)
+    return code | (((i - on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 30)
 
 
 @wp.func
@@ -129,17 +155,18 @@ def _with_counts(group: VplSets, divided: wp.vec2i, count: int, bound: Bound) ->
 
 
 @wp.func
-def bound_on_geometry(evaluated: int, on_lights: int, density: wp.float64, area: wp.float64) -> Bound:
-    """The bound on G where a pixel evaluates `evaluated` VPLs, `on_lights` of them on lights.
+def bound_on_geometry(of_lights: wp.vec2i, of_surfaces: wp.vec2i, density: wp.float64, area: wp.float64) -> Bound:
+    """The bound on G where a pixel evaluates one set of either kind, divided by `divide_blocks`.
 
-    A VPL stands for area/evaluated of the surfaces. G can exceed the bound within a disk of `_BOUND_AREAS` times that
-    area. `density` says how much denser guided VPLs lie where they matter.
+    A VPL stands for the area of the surfaces over the number that is evaluated. G can exceed the bound within a disk of
+    `_BOUND_AREAS` times that area. `density` says how much denser guided VPLs lie where they matter.
     """
+    evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
     out = Bound()
     out.minimum = UNBOUNDED
     if area > wp.float64(0.0):
         out.minimum = float(_PI * wp.float64(evaluated) * density / (_BOUND_AREAS * area))
-    out.per_pdf_area = float(_PI * wp.float64(on_lights) / _BOUND_AREAS)
+    out.per_pdf_area = float(_PI * wp.float64(_LANES * of_lights[1]) / _BOUND_AREAS)
     return out
 
 
@@ -162,31 +189,21 @@ def _divide_into_sets(
     keys: wp.array[wp.int32],
     vpl_sets: wp.array[VplSets],
 ) -> None:
-    """Divides the VPLs into sets, and writes their sort keys.
-
-    The key's most significant part is light or surface, then the set, then the Morton code; empty rows come last.
-    """
+    """Divides the VPLs into sets, and writes their sort keys; empty rows come last."""
     i = first + wp.tid()
     vpls = lights.vpls
     of_lights = divide_blocks(vpls.on_lights, settings.max_sets)
     of_surfaces = divide_blocks(vpls.count[0] - vpls.on_lights, settings.max_sets)
     if i == 0:
-        evaluated = _LANES * wp.max(of_lights[1] + of_surfaces[1], 1)
-        bound = bound_on_geometry(evaluated, _LANES * of_lights[1], settings.density, settings.area)
+        bound = bound_on_geometry(of_lights, of_surfaces, settings.density, settings.area)
         vpl_sets[0] = _with_counts(lights, of_lights, vpls.on_lights, bound)
         vpl_sets[1] = _with_counts(surfaces, of_surfaces, vpls.count[0] - vpls.on_lights, bound)
     lights.order[i] = i
     keys[i] = _LAST
     if i < vpls.count[0]:
         p = vpls.position[i]
-        code = int(0)
-        for k in range(3):
-            cell = wp.clamp(int((p[k] / settings.extent + 0.5) * 64.0), 0, 63)
-            code = code | (spread_bits(cell) << k)
-        if i < vpls.on_lights:
-            keys[i] = code | ((i // (of_lights[1] * _LANES)) << 18)
-        else:
-            keys[i] = code | (((i - vpls.on_lights) // (of_surfaces[1] * _LANES)) << 18) | (1 << 30)
+        place = wp.vec3(p[0], p[1], p[2]) / settings.extent
+        keys[i] = sort_key(place, i, vpls.on_lights, of_lights, of_surfaces)
 
 
 @wp.func
