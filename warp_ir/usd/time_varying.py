@@ -32,7 +32,7 @@ class TimeVarying:
         self.layout_varies = False
         """Whether a drawable prim's transform or visibility may vary: each time then needs a new traversal."""
         self._nothing_varies = not any(
-            attribute.ValueMightBeTimeVarying()
+            attribute.ValueMightBeTimeVarying() or attribute.GetName() in _VELOCITY_ATTRIBUTES
             for root in (stage.GetPseudoRoot(), *stage.GetPrototypes())
             for prim in Usd.PrimRange(root, _ALL)
             for attribute in prim.GetAuthoredAttributes()
