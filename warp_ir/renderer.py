@@ -255,7 +255,8 @@ class Renderer:
         resolved = wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
-        needed = columns * rows * pixel_bytes(scene, resolved)
+        guided = resolved.guiding is not None and resolved.guiding.visibility
+        needed = columns * rows * pixel_bytes(scene, resolved, guided=guided)
         if needed > self._held and needed > (available := self.launcher.memory() + self._held):
             raise InputError(
                 f"width: {columns} x {rows} pixels need about {gibibytes(needed)},"

@@ -101,6 +101,33 @@ def _draw_vpl(group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32) -> Dr
     return out
 
 
+@wp.func
+def _is_visible(scene: SceneData, group: VplSets, x: ShadingPoint, slot: int) -> bool:
+    vpl = group.order[slot]
+    modifiers = int(-1)
+    if scene.modifier_count > 0 and vpl < group.vpls.on_lights:
+        modifiers = group.vpls.modifiers[vpl]
+    return wp.max(light_visibility(scene, modifiers, x, group.vpls.position[vpl])) > 0.0
+
+
+@wp.func
+def _probe_section(
+    scene: SceneData, group: VplSets, cell: int, x: ShadingPoint, seed: wp.uint32, probed: ProbedTiles, row: int
+) -> None:
+    """Sends a ray to a VPL of a section, and notes in a row what it finds; nothing if none of them contributes."""
+    drawn = _draw_vpl(group, cell, x, seed)
+    if drawn.slot < 0:
+        return
+    bit = wp.uint64(1) << wp.uint64(cell)
+    light = drawn.light * float(group.sets)
+    seen = float(0.0)
+    probed.sent[row] = probed.sent[row] | bit
+    if _is_visible(scene, group, x, drawn.slot):
+        probed.arrived[row] = probed.arrived[row] | bit
+        seen = light
+    probed.light[row] = probed.light[row] + wp.vec2(light, seen)
+
+
 @wp.kernel(module="warp_ir.vpl.emission", cuda_max_registers=MAX_REGISTERS)  # reuses functions compiled there
 def _probe_tiles(
     first: int,
@@ -131,28 +158,9 @@ def _probe_tiles(
                 # In another tile the same point probes other sections.
                 lane = (point + int(seed % wp.uint32(_LANES))) % _LANES
                 cell = CELLS_OF_LANE * lane + ray_of_point // 2
-                group = vpl_sets[kind]
-                if group.count > 0:
+                if vpl_sets[kind].count > 0:
                     ray_seed = sobol.hash_combine(seed, wp.uint32(2 * cell + kind))
-                    drawn = _draw_vpl(group, cell, x, ray_seed)
-                    if drawn.slot >= 0:
-                        bit = wp.uint64(1) << wp.uint64(cell)
-                        light = drawn.light * float(group.sets)
-                        probed.sent[2 * i + kind] = probed.sent[2 * i + kind] | bit
-                        seen = float(0.0)
-                        if _is_visible(scene, group, x, drawn.slot):
-                            probed.arrived[2 * i + kind] = probed.arrived[2 * i + kind] | bit
-                            seen = light
-                        probed.light[2 * i + kind] = probed.light[2 * i + kind] + wp.vec2(light, seen)
-
-
-@wp.func
-def _is_visible(scene: SceneData, group: VplSets, x: ShadingPoint, slot: int) -> bool:
-    vpl = group.order[slot]
-    modifiers = int(-1)
-    if scene.modifier_count > 0 and vpl < group.vpls.on_lights:
-        modifiers = group.vpls.modifiers[vpl]
-    return wp.max(light_visibility(scene, modifiers, x, group.vpls.position[vpl])) > 0.0
+                    _probe_section(scene, vpl_sets[kind], cell, x, ray_seed, probed, 2 * i + kind)
 
 
 @wp.func_native("""
