@@ -81,7 +81,7 @@ def merge(films, output, *words):
     ],
 )
 def test_merged_parts_are_the_picture(tmp_path, stage, words):
-    """The same bits in any order of the films, and up to rounding those of a render in one go, filtered or not."""
+    """A merged picture has the same bits in any order of its films, and up to rounding those of one render."""
     films = render_parts(tmp_path, *words, stage=stage)
     whole = tmp_path / "whole.npy"
     assert main(["render", stage, str(whole), *SMALL, *words, "--aov", "depth", "alpha"]) == 0
@@ -120,7 +120,7 @@ def test_merge_writes_as_render_does(tmp_path):
 
 @pytest.mark.extended
 def test_films_that_make_up_no_picture(tmp_path, capsys):
-    """Of other scenes, settings, numbers; twice, missing, not finished; no parts at all: one line names the film."""
+    """Films of other scenes, settings or numbers, doubled, missing, unfinished, of no part: one line names the film."""
     (tmp_path / "other").mkdir()
     films, fewer = render_parts(tmp_path), render_parts(tmp_path / "other", "--seed", "2")
     halves = tmp_path / "h.npy"
@@ -156,7 +156,7 @@ def test_films_that_make_up_no_picture(tmp_path, capsys):
 
 @pytest.mark.extended
 def test_a_part_goes_on_where_it_was_stopped(tmp_path, capsys, caplog):
-    """The same bits as in one go; a finished one is skipped; no part takes the place of another, or of a picture."""
+    """A resumed part has the bits of one go, a finished one is skipped, and none takes the place of another film."""
     (film, *_), whole = render_parts(tmp_path, parts=1), (tmp_path / "whole.npy")
     (tmp_path / "a").mkdir()
     films = render_parts(tmp_path / "a", parts=2)

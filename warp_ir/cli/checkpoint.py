@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +58,7 @@ class Checkpoint:
         try:
             self._film.resume(self.path, self._key())
         except InputError as error:
-            raise InputError(f"--resume: {error}; remove it, or render without --resume") from None
+            raise not_resumed(error) from None
         return True
 
     def write_if_due(self) -> None:
@@ -109,6 +109,11 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
 
 
+def not_resumed(error: InputError) -> InputError:
+    """The error of a checkpoint that cannot be continued, and what to do about it."""
+    return InputError(f"--resume: {error}; remove it, or render without --resume")
+
+
 def checkpoint_path(output: Path) -> Path:
     """Path of the checkpoint of a picture."""
     return output.with_name(output.name + ".film.npz")
@@ -119,10 +124,15 @@ def fingerprint(scene: Scene, settings: RenderSettings, *picture: object) -> str
 
     With `picture`, what else a picture is made with, also of that and of the limits of the render.
     """
-    digest = hashlib.blake2b(digest_size=16)
     left_out = () if picture else _UNHASHED_SETTINGS
     hashed = {name: value for name, value in settings.to_dict().items() if name not in left_out}
-    digest.update(f"{__version__} {hashed} {picture}".encode())
+    text = f"{__version__} {hashed} {picture} {_scene_hash(scene)}"
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+@lru_cache(maxsize=1)  # a picture and its checkpoint have keys of their own, and a scene may have gigabytes
+def _scene_hash(scene: Scene) -> str:
+    digest = hashlib.blake2b(digest_size=16)
     _add(digest, scene, {})
     return digest.hexdigest()
 

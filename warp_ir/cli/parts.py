@@ -90,12 +90,24 @@ def read_part(path: str | Path) -> PartFilm:
     Raises:
         InputError: The file is missing, is no film, or is not one of a part.
     """
+    film = read_film(path)
+    if film is None:
+        raise InputError(f"{path}: is no part of a picture, such as warp-ir render --part 1/4 writes")
+    return film
+
+
+def read_film(path: str | Path) -> PartFilm | None:
+    """`read_part` of any film; None: it is of a whole picture.
+
+    Raises:
+        InputError: The file is missing, or is no film.
+    """
     with importing():
         from warp_ir.film import read_state
 
     state = read_state(path)
     if not state.note:
-        raise InputError(f"{path}: is no part of a picture, such as warp-ir render --part 1/4 writes")
+        return None
     try:
         note = json.loads(state.note)
         numbers = [note[name] for name in ("part", "parts", "total")]

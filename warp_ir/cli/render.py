@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import warp_ir as ir
 from warp_ir.cli.arguments import settings_of
-from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint
+from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint, not_resumed
 from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
-from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_part
+from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_film
 from warp_ir.cli.stage_options import frames_per_second, open_reader, time_code_of
 from warp_ir.files import check_output, whole_file
 from warp_ir.image.exr import COMPRESSIONS, LOSSY, ExrOptions
@@ -473,18 +473,13 @@ def _check_part(part: Part | None, film: Path, *, resume: bool) -> None:
     """Raises `InputError` if the film that is there is of another part: one must not take the other's place."""
     if not film.exists():
         return
-    from warp_ir.film import read_state
-
     try:
-        note = read_state(film).note
-    except InputError:
-        return  # it is damaged, and replaced; or `Checkpoint.resume` refuses it
-    try:
-        other = read_part(film).part if note else None
-    except InputError:
+        found = read_film(film)
+    except InputError as error:
         if resume:
-            raise
+            raise not_resumed(error) from None
         return  # it is damaged, and replaced
+    other = None if found is None else found.part
     if other != part:
         holds = "an unfinished picture" if other is None else f"{other} of {other.total} iterations"
         raise InputError(f"{film}: holds {holds}: name another OUTPUT, or remove it")
