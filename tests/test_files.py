@@ -185,7 +185,7 @@ def test_depth_of_the_paths_of_a_crate_file(monkeypatch, tmp_path):
 @pytest.mark.extended
 @pytest.mark.parametrize("depth", [MAX_DEPTH, 100_000])
 def test_a_deep_stage_does_not_end_the_process(tmp_path, depth):
-    """What is let through is read, what is not is one line."""
+    """A file that the check lets through is read; one that it refuses is one line."""
     stage = tmp_path / "deep.usda"
     stage.write_text(nested(depth))
     done = subprocess.run([sys.executable, "-m", "warp_ir", "info", stage], capture_output=True, text=True)

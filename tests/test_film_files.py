@@ -164,7 +164,7 @@ def test_a_forged_film_is_refused(renderer, whole, tmp_path, name):
 
 
 def test_what_is_not_forged_is_read(renderer, whole, tmp_path):
-    """The same archive, written by the same means."""
+    """A film file with other members, written by the same means."""
     film = renderer.new_film()
     film.resume(archive(tmp_path / "film.npz", whole[0]), "room")
     assert film.iterations == 4 and ir.Film.load(tmp_path / "film.npz").iterations == 4

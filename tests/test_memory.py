@@ -227,7 +227,7 @@ def test_control_groups_limit_the_memory(tmp_path, monkeypatch, version):
     root = tmp_path / "memory" if version == 1 else tmp_path
     limit, usage = memory._CGROUP_FILES[version == 1]
     inactive = "total_inactive_file" if version == 1 else "inactive_file"
-    groups = ("", "max", 0), ("farm", 5000, 3000), ("farm/job", 4000, 1500), ("farm/job/deep", "max", 7)
+    groups = ("", "max", 0), ("batch", 5000, 3000), ("batch/job", 4000, 1500), ("batch/job/deep", "max", 7)
     for path, bound, used in groups:
         group = root / path
         group.mkdir(parents=True, exist_ok=True)
@@ -238,14 +238,14 @@ def test_control_groups_limit_the_memory(tmp_path, monkeypatch, version):
     monkeypatch.setattr(memory, "_CGROUPS", tmp_path)
     monkeypatch.setattr(memory, "_OWN_CGROUPS", own)
     prefix = "4:cpu:/other\n3:memory:" if version == 1 else "0::"
-    inside = dict.fromkeys(("/farm/job/deep", "/farm/job", "/farm"), 2200)
+    inside = dict.fromkeys(("/batch/job/deep", "/batch/job", "/batch"), 2200)
     for path, left in (inside | dict.fromkeys(("/", "/elsewhere"), math.inf)).items():
         own.write_text(f"{prefix}{path}\n")
         assert memory._left_by_cgroups() == left, path
         if left < math.inf:
             assert memory.available_memory() == left
-    (root / "farm" / "job" / limit).write_text("1000\n")  # less than is used
-    own.write_text(f"{prefix}/farm/job\n")
+    (root / "batch" / "job" / limit).write_text("1000\n")  # less than is used
+    own.write_text(f"{prefix}/batch/job\n")
     assert memory.available_memory() == 0.0
     (root / limit).write_text("600\n")  # in a container
     (root / usage).write_text("500\n")

@@ -150,7 +150,7 @@ def test_images_are_those_of_newton():
 
 @pytest.mark.parametrize("kind", KINDS[:-1])
 def test_direct_light_is_newtons_formula(kind):
-    """Of a lone convex body, the light of a sun and of both halves of the sky is Newton's formula within 0.2 %.
+    """A lone convex body reflects the light of a sun and of both halves of the sky by Newton's formula, within 0.2 %.
 
     Nothing shadows it. The segments of curved shapes, and the dome's rows about the horizon, are 2e-4 of it.
     """

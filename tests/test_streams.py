@@ -41,7 +41,7 @@ def test_a_picture_needs_no_streams(tmp_path, redirections, said):
 
 
 def test_a_lost_result_is_an_error():
-    """What is printed is all that `info` makes: where it cannot be printed, that is one line and exit code 1."""
+    """Text is all that `info` makes: where it cannot be printed, that is one line and exit code 1."""
     done = shell(">/dev/full", "info", ROOM)
     assert (done.returncode, done.stderr) == (
         1,

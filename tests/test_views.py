@@ -252,7 +252,7 @@ def test_a_step_reads_nothing_back(monkeypatch):
 
 
 def test_a_captured_step_has_the_same_bits():
-    """What is captured and replayed is what is launched; the number of the step counts on the device."""
+    """A captured step replays what was launched; the number of the step counts on the device."""
     scene = boxes(2)
     views = ir.Views(scene, ir.ViewSettings(light_paths=64))
     poses, bundle = array([EYE] * 2, wp.transformf), array(rays(), wp.vec3)
