@@ -2,8 +2,8 @@
 
     python benchmarks/loads.py [NAME ...] [--json FILE] [--markdown FILE]
 
-Each load is a process of its own: the scene is made on the host; then what the process grows by in the upload and in two
-iterations is compared with `warp_ir.memory`. `steady` is a thousand renders and a thousand updates of a small scene.
+Each load is a process of its own: the scene is made on the host; then what the process grows by in the upload and in
+two iterations is compared with `warp_ir.memory`. `steady` is a thousand renders and a thousand updates of one scene.
 """
 
 import argparse

@@ -1,6 +1,7 @@
 """What is hard on numbers: the cases of benchmarks/stress.py, with few seeds; the program itself takes more."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,11 +13,14 @@ import stress
 
 LONG = ("10^5 iterations", "fireflies over iterations")
 """Cases of minutes."""
+QUICK = ("albedo 0.999", "albedo 1")
+CASES = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.extended) for name in stress.CASES if name not in LONG
+]
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("name", [name for name in stress.CASES if name not in LONG])
+@pytest.mark.parametrize("name", CASES)
 def test_the_limit_is_kept(name, estimator):
     """The case's own docstring is the fact; limits of comparisons include three standard errors of theirs."""
     found = stress.CASES[name](estimator, 2)
@@ -35,8 +39,6 @@ def test_the_limit_is_kept_with_more_seeds(name, estimator):
 def test_a_limit_can_fail():
     """A room with a hole in its wall is not dark, and a value that is no number keeps no limit."""
     assert not stress.Finding(float("nan"), 1.0, "").holds
-    from dataclasses import replace
-
     scene = stress.dark_room(0.0, stress.np.eye(3))
     box = scene.meshes[0]
     open_box = replace(box, triangles=box.triangles[:-2], material=box.material[:-2])
