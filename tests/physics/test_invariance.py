@@ -11,7 +11,7 @@ from tests.physics.scenes import box_with_lights
 from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cornell_box, mesh
 from warp_ir.renderer import Renderer
-from warp_ir.scene import LightKind
+from warp_ir.scene import LightKind, Projection
 
 pytestmark = pytest.mark.parametrize("estimator", ESTIMATORS)
 
@@ -28,8 +28,10 @@ def transformed(scene, linear, shift):
     scale = np.cbrt(np.linalg.det(linear))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, shift
-    camera = matrix @ scene.camera.world_from_camera
-    camera[:3, :3] /= scale
+    camera = scene.camera
+    world_from_camera = matrix @ camera.world_from_camera
+    world_from_camera[:3, :3] /= scale
+    flat = scale if camera.projection == Projection.ORTHOGRAPHIC else 1.0
     lights = [
         dataclasses.replace(
             light,
@@ -42,7 +44,13 @@ def transformed(scene, linear, shift):
         scene,
         meshes=tuple(dataclasses.replace(m, points=m.points @ linear.T + shift) for m in scene.meshes),
         lights=tuple(lights),
-        camera=dataclasses.replace(scene.camera, world_from_camera=camera),
+        camera=dataclasses.replace(
+            camera,
+            world_from_camera=world_from_camera,
+            window=tuple(flat * x for x in camera.window),
+            lens_radius=scale * camera.lens_radius,
+            focus_distance=scale * camera.focus_distance,
+        ),
     )
 
 

@@ -1,6 +1,4 @@
-"""Walls keep light out, however thin they are."""
-
-import dataclasses
+"""Walls keep light out, however thin they are: here the walks of light, and whole pictures in benchmarks/stress.py."""
 
 import numpy as np
 import pytest
@@ -8,11 +6,9 @@ import warp as wp
 
 import warp_ir as ir
 from warp_ir.device_scene import SceneData, upload_scene
-from warp_ir.estimators import ESTIMATORS
 from warp_ir.procedural import cube, mesh
 from warp_ir.sampling import sobol
 from warp_ir.sampling.square_to import square_to_cone, square_to_cosine_hemisphere
-from warp_ir.scene import LightKind
 from warp_ir.surface import closest
 
 pytestmark = pytest.mark.extended
@@ -51,44 +47,3 @@ def test_no_walk_gets_through(launcher, seed):
     escaped = launcher.zeros(1 << 20, wp.int32)
     launcher.launch(_walk, len(escaped), [scene.data, wp.vec3(*turn[:, 0]), 0.3 * scene.frame.scale, escaped])
     assert np.count_nonzero(escaped.numpy()) == 0
-
-
-def dark_room(thickness, turn):
-    """A closed box around the camera, in bright light from outside."""
-    walls = []
-    for size in (2.0, 2.0 * (1.0 + thickness)) if thickness > 0.0 else (2.0,):
-        points, triangles = cube(size)
-        walls.append(mesh(f"wall {size}", points @ turn.T, triangles))
-    points, triangles = cube(0.2)
-    outside = [mesh(f"lamp {k}", (points + np.eye(3)[k] * 1.5) @ turn.T, triangles, 1) for k in range(3)]
-    dome = ir.Light("sky", LightKind.DOME, (10.0,) * 3)
-    sun = ir.Light("sun", LightKind.DISTANT, (1.0e4,) * 3, angle=1.0)
-    return ir.Scene(
-        meshes=(*walls, *outside),
-        materials=(ir.Material("wall", (0.9,) * 3), ir.Material("lamp", (0.5,) * 3, (100.0,) * 3)),
-        lights=(dome, sun),
-        camera=ir.Camera.look_at((0.3, 0.2, 0.5), (-0.2, 0.0, -1.0), fov=100.0),
-    )
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("thickness", [0.0, 1.0e-6, 1.0e-3])
-@pytest.mark.parametrize("turned", [False, True])
-def test_no_light_gets_through(estimator, thickness, turned, device):
-    """Inside a closed box the radiance is exactly 0, whatever shines outside and however the walls are turned."""
-    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] if turned else np.eye(3)
-    settings = ir.RenderSettings(width=32, height=32, iterations=4, light_paths=256, estimator=estimator)
-    film = ir.render(dark_room(thickness, turn), settings, device=device)
-    np.testing.assert_array_equal(film.radiance(), 0.0)
-    np.testing.assert_array_equal(film.aov("alpha"), 1.0)
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_an_opening_lets_it_in(estimator, device):
-    """The same box without one wall is lit: the test above can fail."""
-    scene = dark_room(0.0, np.eye(3))
-    box = scene.meshes[0]
-    open_box = dataclasses.replace(box, triangles=box.triangles[:-2], material=box.material[:-2])
-    settings = ir.RenderSettings(width=32, height=32, iterations=4, light_paths=256, estimator=estimator)
-    film = ir.render(dataclasses.replace(scene, meshes=(open_box, *scene.meshes[1:])), settings, device=device)
-    assert film.radiance().mean() > 0.1

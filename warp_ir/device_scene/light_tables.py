@@ -47,7 +47,7 @@ def upload_lights(
         InputError: A light has no area, or its shaping or links are not usable.
     """
     lights = scene.lights
-    axes = np.array([_light_axes(light) * _unit(light, frame) for light in lights]).reshape(-1, 3, 3)
+    axes = np.array([_light_axes(light, frame) for light in lights]).reshape(-1, 3, 3)
     origin = frame.to_device(np.array([light.world_from_light[:3, 3] for light in lights]).reshape(-1, 3))
     radiance = np.array([light.radiance for light in lights], np.float64).reshape(-1, 3)
     is_point = np.array([light.kind == LightKind.POINT for light in lights], bool)
@@ -80,7 +80,9 @@ def upload_lights(
     shapes = [k for k, light in enumerate(lights) if light.kind <= LightKind.CYLINDER]
     centre = origin[shapes] if shapes else np.full((1, 3), 1.0e6)
     # Larger than the shape by more than rounding: rays must reach the box of a lamp that lies in a surface before it.
-    reach = np.abs(axes[shapes]).sum(axis=2) * 1.001 + np.abs(centre) * 2.0**-18 if shapes else np.zeros((1, 3))
+    spans = axes[shapes].copy()
+    spans[[lights[k].kind <= LightKind.DISK for k in shapes], :, 2] = 0.0  # flat: nothing of it lies off its plane
+    reach = np.abs(spans).sum(axis=2) * 1.001 + np.abs(centre) * 2.0**-18 if shapes else np.zeros((1, 3))
     data.shape_count = len(shapes)
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))
@@ -121,14 +123,14 @@ def _rows(table: Floats, shape: tuple[int, ...] = (3,)) -> npt.NDArray[np.float3
     return np.asarray(table, np.float32) if len(table) else np.zeros((1, *shape), np.float32)
 
 
-def _unit(light: Light, frame: DeviceFrame) -> float:
-    """Device units per scene unit for lights with an area; the axes of the others are directions, without a unit."""
-    return frame.scale if light.kind <= LightKind.CYLINDER else 1.0
+def _light_axes(light: Light, frame: DeviceFrame) -> Floats:
+    """Columns: the images of the unit shape's axes in the device frame, or a rotation where there is no area.
 
-
-def _light_axes(light: Light) -> Floats:
-    """Columns: the images of the unit shape's axes; for flat shapes, z is the unit normal of the emitting side."""
+    For flat shapes, z is the unit normal of the emitting side.
+    """
     linear = light.world_from_light[:3, :3].astype(np.float64)
+    if light.kind <= LightKind.CYLINDER:
+        linear = linear * frame.scale
     if light.kind in (LightKind.RECT, LightKind.DISK):
         size = (light.width, light.height) if light.kind == LightKind.RECT else (light.radius, light.radius)
         x, y = linear[:, 0] * size[0], linear[:, 1] * size[1]

@@ -115,6 +115,8 @@ def _light_of_spot(address: wp.uint64, x: ShadingPoint, stream: wp.uint32, max_r
         if hit.triangle < 0 or (reflections > 0 and length > _SPOT_DISTANCE * size):
             break
         size = wp.max(size, length)
+        if _SPOT_DISTANCE * size > 2.0 * scene.radius:
+            break  # no point of the scene is far enough from this spot, nor from a later one
         rho = albedo(scene, hit, scene.footprint)
         to_spot = hit.position - x.position
         squared = wp.dot(to_spot, to_spot)

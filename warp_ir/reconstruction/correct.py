@@ -132,12 +132,15 @@ def _apply_gains(
     residual: IrradianceLayer,
     gains: wp.array2d[wp.vec2],
 ) -> None:
-    """Multiplies the reflected radiance of a pixel by the local gain."""
+    """Multiplies the reflected radiance of a pixel by the local gain.
+
+    Where both corrections have taken away more than there is, as they can on an edge, nothing is left.
+    """
     p = first + wp.tid()
     gain = _gain_at(gains, p % surfaces.columns, p // surfaces.columns)
     radiance = _filtered_radiance(film, out, residual, p)
-    out.rows[0, p] = out.rows[0, p] + radiance.direct * (gain[0] - 1.0)
-    out.rows[1, p] = out.rows[1, p] + radiance.indirect * (gain[1] - 1.0)
+    out.rows[0, p] = wp.max(out.rows[0, p] + radiance.direct * (gain[0] - 1.0), wp.vec3(0.0))
+    out.rows[1, p] = wp.max(out.rows[1, p] + radiance.indirect * (gain[1] - 1.0), wp.vec3(0.0))
 
 
 def correct(
