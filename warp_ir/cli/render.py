@@ -9,7 +9,7 @@ import platform
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint, not_resumed
 from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
+from warp_ir.cli.engine_flags import as_cluster, check_engine, device_of, open_executor, stage_source
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
 from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_film
@@ -32,6 +33,7 @@ from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 
 if TYPE_CHECKING:
+    from warp_ir.engine import Executor
     from warp_ir.film import Film
     from warp_ir.renderer import Renderer
     from warp_ir.scheduling import Progress
@@ -68,6 +70,8 @@ class _Job:
     reader: "StageReader"
     view: tuple[str, str] | None
     """OpenColorIO's display and view; None: pictures are tone-mapped."""
+    executor: "Executor | None" = None
+    """What renders the parts of a picture; None: its renderer, which has no parts."""
     films: Sequence[PartFilm] = ()
     """The parts that the picture is made of; none: it is rendered."""
     preview: "FilmPreview | None" = None
@@ -88,6 +92,8 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
     """
     # All errors of the command line are reported before anything is loaded.
     part_of(args, settings_of(args))
+    if not films:
+        check_engine(args)
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     _check_exr_flags(args, into_folder)
@@ -99,7 +105,22 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
             check_output(path, SUFFIXES, make_folder=args.make_output_path)
     if args.stats:
         check_output(args.stats, (".json",), make_folder=args.make_output_path)
-    device = open_device(args.device, verbose=args.verbose)
+    if films:
+        return _render_pictures(args, pictures, view, None, films)
+    with open_executor(args) as executor:
+        return _render_pictures(args, pictures, view, executor)
+
+
+def _render_pictures(
+    args: argparse.Namespace,
+    pictures: Sequence[_Picture],
+    view: tuple[str, str] | None,
+    executor: "Executor | None",
+    films: Sequence[PartFilm] = (),
+) -> int:
+    """Renders pictures, by default those of the stage's products; returns the exit code."""
+    name = args.device if films else device_of(args, executor)
+    device = open_device(name, verbose=args.verbose)
     with importing():
         _ = ir.load_usd, ir.Renderer  # imported here, so that the first frame's time does not include it
     versions = _versions()
@@ -115,10 +136,10 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
     exposure = None if args.exposure == "auto" else args.exposure
-    job = _Job(args, device, versions, reader, view, films, preview, exposure=exposure)
+    job = _Job(args, device, versions, reader, view, executor, films, preview, exposure=exposure)
     if films:
         pictures = [_merged_picture(job)]
-    elif into_folder:
+    elif not pictures:
         pictures = _products(job)
 
     frames: list[dict[str, Any]] = []
@@ -294,7 +315,11 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 _merge(job.films, film, renderer, fingerprint(scene, renderer.settings))
             else:
                 iterations = None if part is None else part.iterations
-                renderer.render(film, report, started=started, reserve=reserve, iterations=iterations)
+                _render_film(job, picture, film, report, started=started, reserve=reserve, iterations=iterations)
+        except InputError:
+            if not job.films and (saved := checkpoint.keep()):
+                say(f"{saved}: --resume continues from this checkpoint")
+            raise
         except MemoryError as error:
             _say_saved(checkpoint.keep(), checkpoint, f"out of memory: {error}")
             raise
@@ -389,6 +414,22 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
         "warnings": [*scene.warnings, *picture_warnings],
     }
     return statistics, code
+
+
+def _render_film(
+    job: _Job, picture: _Picture, film: "Film", progress: "Callable[[Progress], None]", **limits: Any
+) -> None:
+    """Adds iterations to the film where the flags want them to run; `limits` are those of `Renderer.render`."""
+    assert job.renderer is not None
+    if job.executor is None:
+        job.renderer.render(film, progress, **limits)
+        return
+    from warp_ir.engine import render_parts
+
+    cluster = as_cluster(job.executor)
+    if cluster is not None and job.args.shared_files:
+        cluster.source = stage_source(job.args, picture.time, picture.product)
+    render_parts(job.renderer, job.executor, film, progress, size=job.args.part_iterations, **limits)
 
 
 def _exr_options(job: _Job, picture: _Picture) -> ExrOptions:
