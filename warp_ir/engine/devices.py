@@ -51,7 +51,7 @@ class Devices:
                 )
         self._renderers = [renderer, *others]
         # Whoever adds to the film of the whole needs the first device in between.
-        gates = [self._gate, *(nullcontext() for _ in others)]
+        gates: list[AbstractContextManager[object]] = [self._gate, *(nullcontext() for _ in others)]
         self._idle = [(PartRenderer(each), gate) for each, gate in zip(self._renderers, gates, strict=True)]
 
     def slots(self) -> int:

@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -110,7 +110,8 @@ class RayCluster:
             import ray
         except ImportError as error:
             raise InputError("engine: ray is not installed: pip install 'warp-ir[cluster]'") from error
-        self._ray, self._workers = ray, workers
+        self._ray: Any = ray  # whose types are there only if it is
+        self._workers = workers
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         options: dict[str, Any] = {"address": address}
         if address is None:
@@ -132,11 +133,8 @@ class RayCluster:
         self._jobs = 0
         self._round: tuple[Round | None, list[Any]] = None, []
         self._capacity, self._looked = 0, -_LOOK_EVERY
-        self._task: Any = ray.remote(
-            num_cpus=self.threads,
-            num_gpus=int(self.kind == "cuda"),
-            max_retries=_RETRIES,
-        )(_render_part)
+        self._options = {"num_cpus": self.threads, "num_gpus": int(self.kind == "cuda"), "max_retries": _RETRIES}
+        self._tasks: dict[Callable[..., Any], Any] = {}
 
     def _connect(self, options: dict[str, Any]) -> None:
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
@@ -156,10 +154,9 @@ class RayCluster:
 
     def prepare(self, renderer: Renderer) -> None:
         """Puts the scene into the object store."""
-        put = self._ray.put
         source = self.source
         job = _Job(
-            scene=[put(renderer.origin)] if source is None else source,
+            scene=self.put(renderer.origin) if source is None else source,
             hash="" if source is None else scene_hash(renderer.origin),
             settings=renderer.part_settings(),
             guiding=renderer.guiding,
@@ -168,7 +165,7 @@ class RayCluster:
             versions=(__version__, wp.__version__),
         )
         self._jobs += 1
-        self._job = f"{self._ray.get_runtime_context().get_job_id()} {self._jobs}", [put(job)]
+        self._job = f"{self._ray.get_runtime_context().get_job_id()} {self._jobs}", self.put(job)
 
     def capacity(self) -> int:
         """Number of workers for which the cluster has room, within `workers`."""
@@ -191,9 +188,19 @@ class RayCluster:
     def start(self, part: Part) -> Hashable:
         """Gives Ray a task."""
         if self._round[0] is not part.round:
-            self._round = part.round, [self._ray.put(part.round)]
+            self._round = part.round, self.put(part.round)
         work = part.iterations, part.strip, part.strips, part.least
-        handle: Hashable = self._task.remote(*self._job, self._round[1], work)
+        return self.start_call(_render_part, *self._job, self._round[1], work)
+
+    def put(self, value: object) -> list[Any]:
+        """Puts something into the object store; workers look into the list, which Ray does not follow."""
+        return [self._ray.put(value)]
+
+    def start_call(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+        """Gives Ray a task of another kind, which a worker has its CPUs or its GPU for."""
+        if function not in self._tasks:
+            self._tasks[function] = self._ray.remote(**self._options)(function)
+        handle: Hashable = self._tasks[function].remote(*arguments)
         return handle
 
     def finished(self, running: Sequence[Hashable], seconds: float) -> Iterable[Hashable]:
@@ -204,11 +211,11 @@ class RayCluster:
         handles: list[Hashable] = done
         return handles
 
-    def fetch(self, handle: Hashable) -> FilmSamples:
-        """Fetches the samples from the object store."""
+    def fetch(self, handle: Hashable) -> Any:
+        """Fetches what a task has returned from the object store: the samples of a part."""
         errors = self._ray.exceptions
         try:
-            samples: FilmSamples = self._ray.get(handle)
+            return self._ray.get(handle)
         except errors.RayTaskError as error:
             cause = error.cause
             if isinstance(cause, InputError):
@@ -216,8 +223,7 @@ class RayCluster:
             raise InputError(f"a worker failed: {type(cause).__name__}: {cause}") from error
         except errors.RayError as error:
             lines = str(error).strip().splitlines() or [type(error).__name__]
-            raise InputError(f"a part was lost: {lines[0]}") from error
-        return samples
+            raise InputError(f"a task was lost: {lines[0]}") from error
 
     def cancel(self, handles: Iterable[Hashable]) -> None:
         """Interrupts the tasks that run, and takes back those that do not."""
