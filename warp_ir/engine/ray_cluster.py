@@ -9,6 +9,7 @@ one part after the other.
 import logging
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -20,6 +21,7 @@ import warp as wp
 from warp_ir import __version__
 from warp_ir.engine.plan import Part, Round
 from warp_ir.engine.worker import PartRenderer
+from warp_ir.files import first_line, reason
 from warp_ir.film import FilmSamples
 from warp_ir.renderer import Renderer
 from warp_ir.scene import InputError, Scene, scene_hash
@@ -43,7 +45,13 @@ _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent to anyone
     "RAY_USAGE_STATS_PROMPT_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_BACKEND_LOG_LEVEL": "fatal",  # what happens to parts is said by us
+    "RAY_SCHEDULER_EVENTS": "0",
 }
+_ATTEMPTS = 3
+"""Times that a local cluster is started: Ray gives its processes 15 s, which a busy machine may not have."""
+_CONNECT_SECONDS = 10.0
+"""Time in which the address of a cluster has to answer [s]: Ray itself tries for minutes."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +145,25 @@ class RayCluster:
         self._tasks: dict[Callable[..., Any], Any] = {}
 
     def _connect(self, options: dict[str, Any]) -> None:
+        host, colon, port = options["address"].rpartition(":")
+        try:
+            if colon:
+                socket.create_connection((host.strip("[]"), int(port)), _CONNECT_SECONDS).close()
+        except (OSError, ValueError, OverflowError) as error:
+            raise InputError(f"address: no Ray cluster at {options['address']!r}: {reason(error)}") from error
+        with suppress(AttributeError):  # it prints what befalls nodes and tasks on the standard output
+            self._ray._private.worker._worker_logs_enabled = False
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            self._ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **options)
-        except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
-            lines = str(error).strip().splitlines() or [type(error).__name__]
-            raise InputError(f"address: no Ray cluster at {options['address']!r}: {lines[0]}") from error
+            for attempts_left in reversed(range(_ATTEMPTS if options["address"] == "local" else 1)):
+                try:
+                    self._ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **options)
+                    return
+                except Exception as error:  # Ray raises plain ones, too
+                    self._ray.shutdown()
+                    what = first_line(str(error)) or type(error).__name__
+                    if not attempts_left:
+                        raise InputError(f"address: no Ray cluster at {options['address']!r}: {what}") from error
         finally:
             for number, handler in handlers.items():  # Ray sets its own
                 with suppress(ValueError, TypeError):  # not in the main thread
@@ -177,6 +198,8 @@ class RayCluster:
             if room == 0 and self._capacity == 0:
                 what = "GPU" if self.kind == "cuda" else f"{self.threads} CPUs"
                 _LOGGER.warning("%s", f"no machine of the cluster has {what} yet: waiting for one")
+            if room != self._capacity and self._capacity:
+                _LOGGER.info("%s", f"the cluster has room for {room} workers now, not {self._capacity}")
             self._capacity = room
         return max(1, min(self._capacity, self._workers or self._capacity))
 
@@ -222,8 +245,8 @@ class RayCluster:
                 raise InputError(str(cause)) from None
             raise InputError(f"a worker failed: {type(cause).__name__}: {cause}") from error
         except errors.RayError as error:
-            lines = str(error).strip().splitlines() or [type(error).__name__]
-            raise InputError(f"a task was lost: {lines[0]}") from error
+            what = first_line(str(error)) or type(error).__name__
+            raise InputError(f"a task was lost: {what}") from error
 
     def cancel(self, handles: Iterable[Hashable]) -> None:
         """Interrupts the tasks that run, and takes back those that do not."""
