@@ -27,6 +27,10 @@ from warp_ir.tiles import tile_count
 
 SCENES = Path(__file__).parents[1] / "scenes_usd"
 RESULT = Path(__file__).parent / "results" / "cluster.json"
+DRIVER_CORES = 16
+"""Cores of the machine on which the modelled program runs."""
+NETWORK = 1.25e9
+"""Its network [bytes/s]: 10 Gbit/s."""
 DETECTION = 30.0
 """Time until Ray notices that a machine does not answer [s], as it is set up."""
 
@@ -42,11 +46,11 @@ class Figures:
     start_seconds: float
     """Time of the program to start a part [s]."""
     add_seconds: float
-    """Time of the program to fetch and to add the samples of a pixel of a part [s]."""
+    """Time of a core to fetch and to add the samples of a pixel of a part [s]."""
     pixel_bytes: float
     """Size of these samples [bytes]."""
     picture_seconds: float
-    """Time of the program to read, filter and write a picture, per pixel [s]."""
+    """Time of a core to filter the picture, per pixel [s]."""
     frame_seconds: float
     """Time of the program for a frame that a worker renders and writes [s]."""
 
@@ -151,11 +155,12 @@ def model_picture(
         return samples(part) * figures.sample_seconds / threads
 
     cluster = ModelCluster(workers, seconds, figures, deaths=deaths)
+    fetch_seconds = figures.add_seconds / DRIVER_CORES + figures.pixel_bytes / NETWORK
     count = 0
     for part, handle in in_order(cluster, parts, lambda: False):
-        cluster.take(handle, samples(part) / len(part.iterations) * figures.add_seconds)
+        cluster.take(handle, samples(part) / len(part.iterations) * fetch_seconds)
         count += 1
-    cluster.now += pixels * figures.picture_seconds
+    cluster.now += pixels * figures.picture_seconds / DRIVER_CORES
     return _outcome(cluster, workers, count)
 
 
@@ -203,9 +208,9 @@ def _time(hours: float) -> str:
     return f"{hours:.1f} h" if hours >= 1.0 else f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.0f} s"
 
 
-def _wait(seconds: float) -> int:
+def _wait(seconds: float) -> np.ndarray:
     time.sleep(seconds)
-    return 0
+    return np.zeros(1 << 17)  # 1 MiB
 
 
 def measure(workers: int = 2, tasks: int = 20, width: int = 512, height: int = 384) -> dict[str, object]:
@@ -241,6 +246,12 @@ def measure(workers: int = 2, tasks: int = 20, width: int = 512, height: int = 3
     cpu = time.process_time()
     run(0.0, 200)
     start_seconds = (time.process_time() - cpu) / 200
+
+    grown = []
+    for count in (500, 2500):
+        run(0.0, count)
+        grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize())
+    out["memory_after_500_and_3000_tasks"] = grown
 
     settings = ir.RenderSettings(width=width, height=height)
     renderer = ir.Renderer(scene, settings, threads=1)

@@ -158,7 +158,7 @@ def test_rounds_limits_and_errors(executor):
     film = render(executor, {"time_limit": 3.0})
     assert 1 <= film.iterations and film.seconds < 6.0
     executor.source = StageSource(TURNTABLE, {}, None, None)
-    with pytest.raises(ir.InputError, match="turntable.usda: is another scene where a worker reads it"):
+    with pytest.raises(ir.InputError, match=r"turntable\.usda: is another scene where a worker reads it"):
         render(executor, {"iterations": 4})
     executor.source = StageSource(str(ROOT / "gone.usda"), {}, None, None)
     with pytest.raises(ir.InputError, match=r"gone\.usda"):

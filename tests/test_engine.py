@@ -1,8 +1,11 @@
 """Parts of a render on several devices: the bits of one device, whoever has rendered what, and when."""
 
+import importlib
 import itertools
+import json
 import random
 from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from warp_ir.image.io import read_image
 from warp_ir.scheduling import RoundScheduler
 from warp_ir.tiles import TILE, tile_count
 
+ROOT = Path(__file__).parent.parent
 ROOM = "scenes_usd/two_rooms.usda"
 SMALL = {"width": 40, "light_paths": 32}
 
@@ -68,11 +72,11 @@ def test_nothing_begins_after_the_deadline():
 
 @pytest.mark.parametrize("kind", ["cpu", "cuda"])
 def test_parts_are_worth_sending_and_not_too_many(kind):
-    """Eight iterations are the least, and a million iterations, or frames of any size, are at most 1024 parts."""
+    """Sixteen iterations are the least, and a million iterations, or frames of any size, are at most 1024 parts."""
     for pixels, total in itertools.product((1, 64 * 48, 512 * 384, 7680 * 4320), (1, 64, 10**6)):
         size = part_iterations(pixels, total, kind, rounds=False)
-        assert size >= 8 and total / size <= 1024
-        assert size * min(pixels, 2**20) <= max(2 * 2**27, 8 * 2**20, 2**20 * total / 1000)
+        assert size >= 16 and total / size <= 1024
+        assert size * min(pixels, 2**20) <= max(2 * 2**27, 16 * 2**20, 2**20 * total / 1000)
 
 
 def test_rounds_grow_by_a_quarter():
@@ -149,6 +153,36 @@ def test_work_that_nobody_wants_is_cancelled():
     tasks = Chaos(slots=4)
     assert list(in_order(tasks, itertools.count(), lambda: len(tasks.results) > 5)) is not None
     assert set(tasks.cancelled) <= set(tasks.results)
+
+
+def test_the_scheduler_at_size(monkeypatch):
+    """10 000 frames, 8K and 10⁶ iterations on a virtual clock: all is done one time, and little is open at a time.
+
+    No more than four pieces for each worker have been started and not been taken, however many there are in all.
+    """
+    monkeypatch.syspath_prepend(str(ROOT))
+    cluster = importlib.import_module("benchmarks.cluster")
+    figures = cluster.Figures(1e-6, 1.0, 1e-3, 1e-7, 156.0, 1e-6, 2e-3)
+    deaths = 1.0 / 600.0  # each worker dies every ten minutes
+    for workers in (1, 100):
+        for outcome, parts in (
+            (cluster.model_frames(10_000, 60.0, workers, figures, deaths=deaths), 10_000),
+            (cluster.model_picture(7680, 4320, 64, workers, figures, deaths=deaths), 4 * 32),
+            (cluster.model_picture(512, 384, 10**6, workers, figures, deaths=deaths), 1024),
+        ):
+            assert outcome.parts == parts and outcome.most_open <= 4 * workers
+            assert outcome.lost > 0 or parts < 1000
+            assert 0.0 < outcome.efficiency <= 1.0
+
+
+@pytest.mark.extended
+def test_modelled_figures_are_those_of_the_model(monkeypatch):
+    """docs/cluster.md shows what `python -m benchmarks.cluster` makes of the figures that are stored."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    cluster = importlib.import_module("benchmarks.cluster")
+    figures = cluster.Figures(**json.loads(cluster.RESULT.read_text())["figures"])
+    shown = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    assert "\n".join(cluster.table(figures)) in shown
 
 
 def films_of(settings, *executors, **more):

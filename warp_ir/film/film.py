@@ -5,7 +5,7 @@ import functools
 import math
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 
@@ -19,7 +19,7 @@ from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, 
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
 from warp_ir.film.picture_noise import PictureNoise, tile_sums
-from warp_ir.film.samples import FilmSamples
+from warp_ir.film.samples import RADIANCE, FilmSamples, merge_rows
 from warp_ir.film.storage import (
     RECONSTRUCTION,
     FilmFile,
@@ -43,8 +43,6 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 """Names that `Film.aov` accepts."""
 Image = npt.NDArray[np.float32]
 """[height, width, 3]."""
-_RADIANCE = ("emission", "direct", "indirect")
-"""The fields of `FilmData` that add up to the radiance."""
 _CLEAN_ITERATIONS = 8
 """Iterations from which the mean albedo and normals have less noise than a denoiser would leave in them."""
 
@@ -63,15 +61,6 @@ def _exclusive(method: "Callable[Concatenate[Film, _P], _R]") -> "Callable[Conca
             return method(film, *args, **kwargs)
 
     return alone
-
-
-def _radiance(arrays: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
-    """Sum of the fields of `FilmData` that are radiance, [rows, 3]."""
-    total = np.zeros_like(arrays["direct"])
-    for name in _RADIANCE:
-        if len(arrays[name]):  # emission may have no rows
-            total += arrays[name]
-    return total
 
 
 class PictureFilter(Protocol):
@@ -198,7 +187,8 @@ class Film:
                 raise InputError(f"film: cannot merge a film with {what} and one without")
         if other.iterations == 0:
             return
-        self._add_rows(slice(None), {name: array.numpy() for name, array in film_arrays(other._data).items()})
+        others = {name: array.numpy() for name, array in film_arrays(other._data).items()}
+        self._add(film_arrays(self._data), None, others)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self._noise = None  # it is of one sequence of iterations
@@ -246,15 +236,8 @@ class Film:
             samples: What `samples` has returned there.
             iterations: Iterations of this film with these samples, and with those that other tiles get from the same.
         """
-        rows = slice(None) if samples.rows is None else samples.rows
         if samples.iterations:
-            names = film_arrays(self._data)
-            self._add_rows(rows, {name: samples.arrays[name] for name in names})
-            for name, array in self._saved_arrays().items():
-                if name not in names:
-                    sums = array.numpy()
-                    sums[rows] += samples.arrays[name]
-                    array.assign(sums)
+            self._add(self._saved_arrays(), samples.rows, samples.arrays)
         for mine, theirs in ((self.timings, samples.timings), (self.counts, samples.counts)):
             for key, value in theirs.items():
                 mine[key] = mine.get(key, 0) + value  # type: ignore[assignment]  # seconds, or numbers
@@ -263,31 +246,18 @@ class Film:
         self._count_skipped()
         self.choose(self.chosen)
 
-    def _add_rows(self, rows: "slice | npt.NDArray[np.intp]", others: dict[str, npt.NDArray[Any]]) -> None:
-        """Merges the arrays of another `FilmData`, of some pixels, into those of this one."""
-        arrays = {name: array.numpy() for name, array in film_arrays(self._data).items()}
-        own = {name: array[rows] if len(array) else array for name, array in arrays.items()}
-        n, m = (values["count"].astype(np.float64) for values in (own, others))
-        weight = (m / np.maximum(n + m, 1.0))[:, None]  # of the other film
-        difference = (_radiance(own) - _radiance(others)).astype(np.float64)
-        for name, array in film_arrays(self._data).items():
-            mine, theirs = own[name], others[name]
-            if not len(mine):
-                continue
-            if name in _RADIANCE:
-                mine = mine + (theirs - mine) * weight
-            elif name == "standard_deviation":
-                mine, theirs = (x.astype(np.float64) ** 2 for x in (mine, theirs))
-                mine = np.sqrt(mine * (1.0 - weight) + theirs * weight + weight * (1.0 - weight) * difference**2)
-            elif name == "mesh":
-                mine = np.where(n > 0, mine, theirs)
-            else:
-                mine = mine + theirs
-            if isinstance(rows, slice):
-                array.assign(mine)
-            else:
-                arrays[name][rows] = mine
-                array.assign(arrays[name])
+    def _add(
+        self,
+        arrays: "dict[str, wp.array[Any]]",
+        rows: npt.NDArray[np.intp] | None,
+        others: Mapping[str, npt.NDArray[Any]],
+    ) -> None:
+        """Merges arrays of other iterations, of some pixels or of all, into those of the film."""
+        mine = {name: array.numpy() for name, array in arrays.items()}  # on a CPU these are the arrays themselves
+        merge_rows(mine, rows, others, self._launcher.threads)
+        if not self._launcher.device.is_cpu:
+            for name, array in arrays.items():
+                array.assign(mine[name])
 
     @overload
     def radiance(self) -> npt.NDArray[np.float32]: ...
@@ -390,7 +360,7 @@ class Film:
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
             pictures.append(self._denoise().copy())
         if not pictures:
-            return self._radiance_of(*_RADIANCE)
+            return self._radiance_of(*RADIANCE)
         # The errors of the two filters are hardly correlated: the mean has less error than the better of them.
         return np.asarray(np.mean(pictures, axis=0)) if len(pictures) > 1 else pictures[0]
 
@@ -401,7 +371,7 @@ class Film:
                 if self.reconstruction is not None:
                     albedo, normal, noisy = self._reconstruct(self.reconstruction)[2:]
                 else:
-                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._radiance_of(*_RADIANCE)
+                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._radiance_of(*RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
                 limit = None if self.settings is None else self.settings.time_limit
                 picture = denoise(noisy, albedo, normal, clean, limit)
@@ -523,7 +493,7 @@ class Film:
 
         There the picture is made of more camera rays than the mean, so that the difference is no bias.
         """
-        difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*_RADIANCE))
+        difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*RADIANCE))
         return np.where(self._near_emission()[..., None], np.float32(0.0), difference)
 
     @_exclusive
