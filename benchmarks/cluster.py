@@ -197,7 +197,7 @@ CASES: dict[str, Callable[[int, Figures], Outcome]] = {
 
 def table(figures: Figures) -> Iterator[str]:
     """The model as a Markdown table: hours and efficiency by number of workers."""
-    yield "| render | " + " | ".join(f"{n} workers" for n in WORKERS) + " |"
+    yield "| render | " + " | ".join(f"{n} worker{'s' * (n > 1)}" for n in WORKERS) + " |"
     yield "|---" * (len(WORKERS) + 1) + "|"
     for name, case in CASES.items():
         cells = [case(n, figures) for n in WORKERS]

@@ -4,6 +4,9 @@ import importlib
 import itertools
 import json
 import random
+import signal
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -257,6 +260,38 @@ def test_parts_are_those_of_merge(tmp_path):
 
 
 @pytest.mark.extended
+def test_a_part_has_parts(tmp_path):
+    """`--part` on two devices is the part: merged, the picture of one render up to rounding."""
+    words = ["--width", "40", "--light-paths", "32", "--iterations", "7", "-q", "--threads", "1"]
+    for number in (1, 2):
+        several = ["--part", f"{number}/2", "--device", "cpu,cpu", "--part-iterations", "2"]
+        assert main(["render", ROOM, str(tmp_path / f"{number}.npy"), *words, *several]) == 0
+    films = [str(tmp_path / f"{number}.npy.film.npz") for number in (1, 2)]
+    assert main(["merge", *films, str(tmp_path / "merged.npy"), "-q"]) == 0
+    assert main(["render", ROOM, str(tmp_path / "whole.npy"), *words]) == 0
+    wanted = read_image(tmp_path / "whole.npy")
+    np.testing.assert_allclose(read_image(tmp_path / "merged.npy"), wanted, rtol=1e-4, atol=1e-5 * wanted.mean())
+
+
+@pytest.mark.extended
+def test_an_interrupted_film_holds_whole_parts():
+    """Ctrl-C abandons the parts that run; the film goes on to the same picture."""
+    (whole,) = films_of({"iterations": 20}, Chaos(), size=2)
+    renderer = ir.Renderer(ir.load_usd(ROOM), ir.RenderSettings(**SMALL, iterations=20), threads=1)
+    devices = Devices(["cpu", "cpu"], 1)
+
+    def interrupt(progress):
+        if progress.iterations == 6:
+            signal.raise_signal(signal.SIGINT)
+
+    film = render_parts(renderer, devices, progress=interrupt, size=2)
+    assert film.interrupted == signal.SIGINT and film.iterations == 6
+    film.interrupted = 0
+    assert_same(render_parts(renderer, devices, film, size=2), whole)
+    devices.close()
+
+
+@pytest.mark.extended
 def test_a_film_goes_on_by_another_executor(tmp_path):
     """A film that was saved between two parts, also in the middle of a round, becomes the same picture."""
     for settings in ({"iterations": 12}, {"target_error": 0.08}):
@@ -306,3 +341,23 @@ def test_flags_that_cannot_be(capsys, words, message):
     assert main(["render", ROOM, "a.npy", *words]) == 2
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
+
+
+@pytest.mark.extended
+def test_a_render_alone_loads_no_engine(tmp_path):
+    """Neither the engine nor Ray is imported by a render that does not ask for them."""
+    words = [
+        "render",
+        str(ROOT / ROOM),
+        str(tmp_path / "a.npy"),
+        "-w",
+        "8",
+        "--iterations",
+        "1",
+        "--device",
+        "cpu",
+        "-q",
+    ]
+    python = f"import sys; from warp_ir.cli import main; assert main({words!r}) == 0\n"
+    python += "assert not {'ray', 'warp_ir.engine'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", python], check=True, cwd=ROOT)
