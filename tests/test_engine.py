@@ -235,6 +235,25 @@ def test_the_picture_does_not_depend_on_who_renders_what(settings, more):
 
 
 @pytest.mark.extended
+def test_tiles_know_what_they_have_left_out():
+    """Of every tile the device knows how many iterations left it out, in a film alone and in that of a part.
+
+    The pixels' samples are numbered by it.
+    """
+    renderer = ir.Renderer(ir.load_usd(ROOM), ir.RenderSettings(**SMALL, target_error=0.1), threads=1)
+    film = renderer.render()
+    left_out = film.iterations - film.tile_iterations
+    assert left_out.max() > 0
+    np.testing.assert_array_equal(film.tiles.skipped.numpy(), left_out)
+    part = renderer.new_film()
+    part.clear(film.chosen, left_out)
+    for iteration in range(3):
+        renderer.add_iteration(part, iteration)
+    np.testing.assert_array_equal(part.tiles.skipped.numpy(), left_out + 3 * ~film.chosen)
+    np.testing.assert_array_equal(part.tile_iterations, 3 * film.chosen)
+
+
+@pytest.mark.extended
 def test_strips_of_a_large_picture_change_no_bit(monkeypatch):
     """A picture that is divided into strips of tiles has the bits of an undivided one, adaptive or not."""
     for settings in ({"iterations": 5}, {"target_error": 0.1}):

@@ -39,6 +39,8 @@ _RETRIES = 8
 """Times that a part is begun anew because its worker or its machine died."""
 _QUEUED = 2
 """Parts that are given to Ray, over those that run: a worker finds the next one, and an autoscaler sees a demand."""
+_HEAD_SECONDS = 20.0
+"""Time after which a head that does not answer is given up [s]."""
 _LOOK_EVERY = 1.0
 """Time between two looks at the machines of the cluster [s]."""
 _ENVIRONMENT = {
@@ -141,6 +143,8 @@ class RayCluster:
         self._jobs = 0
         self._round: tuple[Round | None, list[Any]] = None, []
         self._capacity, self._looked = 0, -_LOOK_EVERY
+        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+        self._head, self._answered = (host.strip("[]"), int(port)), time.monotonic()
         self._options = {"num_cpus": self.threads, "num_gpus": int(self.kind == "cuda"), "max_retries": _RETRIES}
         self._tasks: dict[Callable[..., Any], Any] = {}
 
@@ -191,7 +195,7 @@ class RayCluster:
     def capacity(self) -> int:
         """Number of workers for which the cluster has room, within `workers`."""
         now = time.monotonic()
-        if now - self._looked >= _LOOK_EVERY:
+        if now - self._looked >= _LOOK_EVERY and self._is_head_there():
             self._looked = now
             need = self._resources("GPU") if self.kind == "cuda" else [n / self.threads for n in self._resources("CPU")]
             room = sum(int(n) for n in need)
@@ -202,6 +206,22 @@ class RayCluster:
                 _LOGGER.info("%s", f"the cluster has room for {room} workers now, not {self._capacity}")
             self._capacity = room
         return max(1, min(self._capacity, self._workers or self._capacity))
+
+    def _is_head_there(self) -> bool:
+        """Whether the head answers; Ray itself would end the process without a word after a minute.
+
+        Raises:
+            InputError: It has not answered for some time.
+        """
+        try:
+            socket.create_connection(self._head, 1.0).close()
+        except OSError as error:
+            if time.monotonic() - self._answered > _HEAD_SECONDS:
+                raise InputError(f"the head of the Ray cluster does not answer: {reason(error)}") from error
+            time.sleep(0.1)
+            return False
+        self._answered = time.monotonic()
+        return True
 
     def slots(self) -> int:
         """Two for each worker: one that runs, and one that is queued."""

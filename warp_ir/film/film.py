@@ -140,7 +140,7 @@ class Film:
         self._data = new_film_data(width * height, has_emission, sees_lights, launcher)
         self._sees_dome = sees_dome
         self._skipped: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
-        self._skipped_before = self._skipped  # by the iterations before those of a film that is a part of another
+        self._skipped_before = np.zeros_like(self._skipped)  # by what came before a film that is a part of another
         self.chosen: npt.NDArray[np.bool_] = np.ones(len(self._skipped), bool)
         """[tiles], whether the next iteration is for a tile of 8 x 8 pixels; row by row."""
         self.tiles: Tiles = all_tiles(width, height, launcher)
