@@ -26,6 +26,9 @@ _TIME_MARGIN = 0.8
 """Fraction of the time left that the last iteration is planned to take: the worst tiles take longer than the mean."""
 _UNLIT_ITERATIONS = 64
 """Iterations of a picture without light, after which a target error gives up: no error of it is known."""
+_FIRST_CHOICE = 16
+"""Iterations of all tiles before rounds leave out any: a round may leave out a tile throughout, and the noise of a
+picture is known only if the first doublings of the iterations have sampled every tile."""
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -123,7 +126,7 @@ class RoundScheduler(AdaptiveScheduler):
         end = 2
         while end <= count:
             power = 1 << (end.bit_length() - 1)
-            end += power if end < 16 else power // 4
+            end += power if end < _FIRST_CHOICE else power // 4
         return min(end, settings.iteration_limit)
 
     def finish_round(self) -> None:
@@ -133,7 +136,7 @@ class RoundScheduler(AdaptiveScheduler):
         if self._settings.target_error is not None and self._film.iterations.bit_count() == 1:
             self._film.measure_noise()
         squares = self._measure_error(self._film.squared_errors())
-        if self._adaptive:
+        if self._adaptive and self._film.iterations >= _FIRST_CHOICE:
             self._film.choose(select_tiles(squares, self._film.tile_iterations))
 
     def report(self, reserve: float) -> Progress:
