@@ -33,6 +33,7 @@ LAYERS = [
     ["guiding", "reconstruction", "scheduling"],
     ["estimators", "interrupt"],
     ["renderer", "simulation"],
+    ["engine"],
     ["newton"],
     ["preview"],
     ["view"],

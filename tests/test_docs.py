@@ -30,6 +30,7 @@ SMALL = {
 """Flags that are added to the commands of blocks; of a flag that is given twice the last one counts."""
 NOT_RUN = {
     "README.md": ["python3 -m venv", ".venv/bin/warp-ir view", "python3 -m venv"],
+    "docs/cluster.md": ["pip install", "ray start", "warp-ir render shot"],
     "docs/quickstart.md": [". .venv/bin/activate", "warp-ir view"],
 }
 """What the blocks begin with that are marked as not to be run."""

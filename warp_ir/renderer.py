@@ -72,10 +72,12 @@ class Renderer:
             denoise_seconds(1)  # starts the denoiser before the work: it may be missing, and starting takes a while
         self.launcher = Launcher(device, threads)
         self._scratch = Scratch(self.launcher)
-        self._guiding = guiding
+        self.guiding = guiding
+        """When light paths are guided."""
         self._reported: tuple[dict[str, float], dict[str, int]] = ({}, {})
         self._shutter: list[_ShutterState] = []
-        self._origin: Scene | None = None
+        self.origin = scene
+        """The scene as it was given, with its shutter samples."""
         self._layout: _BufferLayout | None = None
         self._held = 0  # bytes of the pixels
         self._take_settings(scene)
@@ -143,7 +145,7 @@ class Renderer:
                 sees_dome=self._resolved.visible_lights
                 and any(light.kind == LightKind.DOME for light in first.scene.source.lights),
             )
-            film.settings, film.origin = self.settings, self._origin
+            film.settings, film.origin = self.settings, self.origin
             film.emits = any(state.scene.emits for state in self._shutter)
             if self._resolved.filter:
                 self._gbuffer.tiles = film.tiles
@@ -161,7 +163,7 @@ class Renderer:
             InputError: The film is not one that `new_film` makes for the present scene.
         """
         with self.launcher.exclusive:
-            if film.origin is not self._origin or (film.width, film.height) != self._size():
+            if film.origin is not self.origin or (film.width, film.height) != self._size():
                 raise InputError("film: is not of this renderer's present scene and size; new_film() makes one")
             self._gbuffer.tiles = film.tiles
             number = stratum(iteration, len(self._shutter).bit_length() - 1)
@@ -209,7 +211,7 @@ class Renderer:
             first, settings = 0, self.settings
             if iterations is not None:
                 first, settings = iterations.start, replace(settings, iterations=len(iterations))
-            scheduler = AdaptiveScheduler(film, settings, self._is_adaptive())
+            scheduler = AdaptiveScheduler(film, settings, self.is_adaptive())
             profile = self.launcher.profile
             before, rays = profile.seconds(), profile.counts["primary_rays"]
             while not film.interrupted and film.iterations < settings.iteration_limit:
@@ -227,7 +229,7 @@ class Renderer:
                     break
         film.radiance()  # makes the picture, which the film keeps, within the time of the render
         film.seconds = time.perf_counter() - start
-        self._report_profile(film)
+        self.report_profile(film)
         return film
 
     def cryptomattes(self) -> tuple[Cryptomatte, Cryptomatte]:
@@ -241,6 +243,33 @@ class Renderer:
             shutter = [(state.scene, state.camera) for state in self._shutter]
             return measure_coverage(shutter, numbers, self.settings.seed, self.launcher)
 
+    def is_adaptive(self) -> bool:
+        """Whether iterations may leave out tiles.
+
+        A picture whose tiles are chosen by their noise is no unbiased mean, and shutter samples are shared by all
+        pixels.
+        """
+        settings = self._resolved
+        limited = settings.time_limit is not None or settings.target_error is not None
+        return limited and settings.iterations is None and settings.filter and len(self._shutter) == 1
+
+    def part_settings(self) -> RenderSettings:
+        """The settings for renderers of parts of the picture, on devices of any size: without limits and defaults."""
+        settings = replace(self.settings, light_paths=self._resolved.light_paths)
+        return replace(settings, iterations=None, time_limit=None, target_error=None, denoise=False)
+
+    def report_profile(self, film: Film) -> None:
+        """Adds the timings and counts since the last report to the film's."""
+        seconds, counts = self.launcher.profile.seconds(), self.launcher.profile.counted()
+        for phase in seconds:
+            film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._reported[0].get(phase, 0.0)
+        for what in counts:
+            film.counts[what] = film.counts.get(what, 0) + counts[what] - self._reported[1].get(what, 0)
+        film.counts["iterations"] = film.iterations
+        film.counts["skipped_samples"] = film.skipped
+        film.counts.setdefault("graph_launches", 0)
+        self._reported = seconds, counts
+
     def _estimator_modules(self) -> list[ModuleType]:
         """The modules of kernels that the estimator needs on this device."""
         estimator = ESTIMATORS[self._resolved.estimator]
@@ -252,7 +281,7 @@ class Renderer:
         If it refuses, the settings stay as they were.
         """
         wanted = settings or self.wanted
-        resolved = wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
+        resolved = wanted.resolve(scene.camera.aspect, self.guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
         guided = resolved.guiding is not None and resolved.guiding.visibility
@@ -271,7 +300,7 @@ class Renderer:
             raise InputError(f"scene: shutter has {len(scene.shutter)} samples, which is no power of two")
         scenes = scene.shutter if settings.motion_blur and scene.shutter else (scene,)
         uploaded = upload_scenes(scenes, launcher, list({id(s.scene): s.scene for s in self._shutter}.values()))
-        self._shutter, self._origin = [], scene
+        self._shutter, self.origin = [], scene
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
@@ -297,16 +326,6 @@ class Renderer:
         """Columns and rows of the films."""
         return self._shutter[0].camera.columns, self._shutter[0].camera.rows
 
-    def _is_adaptive(self) -> bool:
-        """Whether iterations may leave out tiles.
-
-        A picture whose tiles are chosen by their noise is no unbiased mean, and shutter samples are shared by all
-        pixels.
-        """
-        settings = self._resolved
-        limited = settings.time_limit is not None or settings.target_error is not None
-        return limited and settings.iterations is None and settings.filter and len(self._shutter) == 1
-
     def _picture_seconds(self, film: Film, per_ray: float, per_addition: float) -> float:
         """Estimated time to make the picture [s], if a camera ray and adding a sample to the film take as long [s]."""
         seconds = 0.0
@@ -316,18 +335,6 @@ class Renderer:
         if self.settings.denoise:
             seconds += denoise_seconds(film.width * film.height, self.settings.time_limit)
         return seconds
-
-    def _report_profile(self, film: Film) -> None:
-        """Adds the timings and counts since the last report to the film's."""
-        seconds, counts = self.launcher.profile.seconds(), self.launcher.profile.counted()
-        for phase in seconds:
-            film.timings[phase] = film.timings.get(phase, 0.0) + seconds[phase] - self._reported[0].get(phase, 0.0)
-        for what in counts:
-            film.counts[what] = film.counts.get(what, 0) + counts[what] - self._reported[1].get(what, 0)
-        film.counts["iterations"] = film.iterations
-        film.counts["skipped_samples"] = film.skipped
-        film.counts.setdefault("graph_launches", 0)
-        self._reported = seconds, counts
 
 
 @dataclass(frozen=True)

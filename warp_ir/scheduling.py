@@ -26,6 +26,9 @@ _TIME_MARGIN = 0.8
 """Fraction of the time left that the last iteration is planned to take: the worst tiles take longer than the mean."""
 _UNLIT_ITERATIONS = 64
 """Iterations of a picture without light, after which a target error gives up: no error of it is known."""
+_FIRST_CHOICE = 16
+"""Iterations of all tiles before rounds leave out any: a round may leave out a tile throughout, and the noise of a
+picture is known only if the first doublings of the iterations have sampled every tile."""
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -78,13 +81,18 @@ class AdaptiveScheduler:
         if does_not_fit or measure_error:
             squares = film.squared_errors()
             if measure_error:
-                errors = film.filtered_errors(squares)
-                if math.sqrt(errors.sum()) <= (self._settings.target_error or 0.0):
-                    squares = errors = film.squared_errors(filtered=True)  # expensive: it makes the picture
-                self._error = 1.0 if film.is_unlit() else math.sqrt(errors.sum())
+                squares = self._measure_error(squares)
             if self._adaptive:
                 film.choose(select_tiles(squares, film.tile_iterations, max_tiles))
         return self._progress(reserve + per_iteration + per_tile * film.chosen.sum())
+
+    def _measure_error(self, squares: Floats) -> Floats:
+        """Measures the error of the picture; returns the contributions of the tiles, given those of the mean."""
+        errors = self._film.filtered_errors(squares)
+        if math.sqrt(errors.sum()) <= (self._settings.target_error or 0.0):
+            squares = errors = self._film.squared_errors(filtered=True)  # expensive: it makes the picture
+        self._error = 1.0 if self._film.is_unlit() else math.sqrt(errors.sum())
+        return squares
 
     def _progress(self, needed: float) -> Progress:
         """Progress towards the nearest limit, if the next iteration and the picture need `needed` seconds."""
@@ -102,6 +110,38 @@ class AdaptiveScheduler:
         fraction = min(max(shares), 1.0)
         left = film.seconds * (1.0 / fraction - 1.0) if fraction > 0.0 else math.nan
         return Progress(film.iterations, film.seconds, error, fraction, left, film)
+
+
+class RoundScheduler(AdaptiveScheduler):
+    """The same for a film whose iterations are rendered in rounds, by several devices: it decides between rounds.
+
+    What it decides depends on the film alone, and so not on which device has rendered what, nor on time.
+    """
+
+    def round_end(self) -> float:
+        """Iterations of the film at the end of the round: powers of two, from 16 on also three between them."""
+        settings, count = self._settings, self._film.iterations
+        if not self._adaptive and settings.target_error is None:
+            return settings.iteration_limit
+        end = 2
+        while end <= count:
+            power = 1 << (end.bit_length() - 1)
+            end += power if end < _FIRST_CHOICE else power // 4
+        return min(end, settings.iteration_limit)
+
+    def finish_round(self) -> None:
+        """Measures the error, and chooses the tiles of the next round."""
+        if not self._adaptive and self._settings.target_error is None:
+            return
+        if self._settings.target_error is not None and self._film.iterations.bit_count() == 1:
+            self._film.measure_noise()
+        squares = self._measure_error(self._film.squared_errors())
+        if self._adaptive and self._film.iterations >= _FIRST_CHOICE:
+            self._film.choose(select_tiles(squares, self._film.tile_iterations))
+
+    def report(self, reserve: float) -> Progress:
+        """Reports what has been added to the film; `reserve` is the time that making the picture takes [s]."""
+        return self._progress(reserve)
 
 
 def select_tiles(squares: Floats, iterations: npt.NDArray[np.int32], max_tiles: float = math.inf) -> Mask:

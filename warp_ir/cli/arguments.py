@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from warp_ir import __version__
+from warp_ir.cli.engine_flags import DESTINATIONS, add_engine
 from warp_ir.cli.toml_file import read_toml
 from warp_ir.image.cryptomatte import KINDS
 from warp_ir.image.exr import COMPRESSIONS
@@ -60,9 +61,9 @@ _TOGETHER: tuple[frozenset[str], ...] = (
 )
 """Destinations of flags: one of them on the command line replaces all of a group in a settings file."""
 _NOT_IN_FILES = frozenset({"help", "settings"})
-_NOT_OF_PICTURE = frozenset(
-    {"part", "preview", "make_output_path", "resume", "checkpoint", "stats", "device", "threads"}
-)
+_NOT_OF_PICTURE = DESTINATIONS | {
+    *("part", "preview", "make_output_path", "resume", "checkpoint", "stats", "device", "threads")
+}
 """Destinations of flags of `warp-ir render` that its picture does not depend on."""
 _REPEATED = frozenset({"variants"})
 """Destinations of flags that may be repeated."""
@@ -432,8 +433,10 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     checkpoint = "interval between writes of OUTPUT.film.npz, from which --resume continues (default: 60; 0: never)"
     output.add_argument("--checkpoint", type=_seconds, default=60.0, metavar="SECONDS", help=checkpoint)
     output.add_argument("--stats", metavar="FILE.json", help="write timings, counts, memory use and versions")
-    _add_device(output)
+    several = "; several GPUs with commas share the iterations out"
+    _add_device(output, several)
     _add_threads(output)
+    add_engine(parser, _count)
 
 
 def _add_looks(output: argparse._ArgumentGroup) -> None:
@@ -682,8 +685,8 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
     group.add_argument("--strict", action="store_true", help="stop with an error at the first warning about the stage")
 
 
-def _add_device(group: argparse._ArgumentGroup) -> None:
-    devices = "cpu, cuda:0, ... (default: auto, the first GPU, or the CPU if there is none)"
+def _add_device(group: argparse._ArgumentGroup, more: str = "") -> None:
+    devices = f"cpu, cuda:0, ... (default: auto, the first GPU, or the CPU if there is none){more}"
     group.add_argument("--device", default="auto", metavar="NAME", help=devices)
 
 

@@ -1,21 +1,18 @@
 """Checkpoints: the film is saved next to the picture at intervals, so that a crash loses one interval of work."""
 
-import dataclasses
 import hashlib
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from warp_ir import __version__
 from warp_ir.cli.console import warn
 from warp_ir.files import whole_file
-from warp_ir.scene import InputError, Scene
+from warp_ir.scene import InputError, Scene, scene_hash
 from warp_ir.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -25,8 +22,6 @@ _MAX_TIME_SHARE = 0.05
 """Largest share of the render time that is spent on writing checkpoints."""
 _UNHASHED_SETTINGS = ("iterations", "time_limit", "target_error", "color_space")
 """Settings that do not affect the samples: a resumed render may use other values."""
-_UNHASHED_SCENE_FIELDS = ("warnings", "stats", "name", "settings")
-"""Fields of a `Scene` that do not affect the samples."""
 
 
 class Checkpoint:
@@ -126,44 +121,5 @@ def fingerprint(scene: Scene, settings: RenderSettings, *picture: object) -> str
     """
     left_out = () if picture else _UNHASHED_SETTINGS
     hashed = {name: value for name, value in settings.to_dict().items() if name not in left_out}
-    text = f"{__version__} {hashed} {picture} {_scene_hash(scene)}"
+    text = f"{__version__} {hashed} {picture} {scene_hash(scene)}"
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-
-
-@lru_cache(maxsize=1)  # a picture and its checkpoint have keys of their own, and a scene may have gigabytes
-def _scene_hash(scene: Scene) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    _add(digest, scene, {})
-    return digest.hexdigest()
-
-
-def _add(digest: "hashlib.blake2b", value: object, numbers: dict[int, int]) -> None:
-    """Adds a value to the hash.
-
-    A record that occurs again, as a static mesh does in every shutter sample, is hashed as its number.
-
-    Args:
-        digest: The hash.
-        value: A record, an array, a collection or a plain value.
-        numbers: The id of each record hashed so far -> its number.
-    """
-    if dataclasses.is_dataclass(value) and numbers.setdefault(id(value), len(numbers)) < len(numbers) - 1:
-        digest.update(f"#{numbers[id(value)]}".encode())
-    elif isinstance(value, np.ndarray):
-        digest.update(f"{value.dtype} {value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for field in dataclasses.fields(value):
-            if not (isinstance(value, Scene) and field.name in _UNHASHED_SCENE_FIELDS):
-                digest.update(field.name.encode())
-                _add(digest, getattr(value, field.name), numbers)
-    elif isinstance(value, tuple | list):
-        digest.update(f"{len(value)}".encode())
-        for item in value:
-            _add(digest, item, numbers)
-    elif isinstance(value, frozenset | set):
-        _add(digest, tuple(sorted(value)), numbers)
-    elif isinstance(value, Mapping):
-        _add(digest, tuple(value.items()), numbers)
-    else:
-        digest.update(repr(value).encode())

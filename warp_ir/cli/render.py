@@ -9,7 +9,7 @@ import platform
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from warp_ir.cli.arguments import settings_of
 from warp_ir.cli.checkpoint import Checkpoint, checkpoint_path, fingerprint, not_resumed
 from warp_ir.cli.console import ProgressDisplay, describe_progress, say, say_warnings, show_result, warn
 from warp_ir.cli.device_choice import open_device
+from warp_ir.cli.engine_flags import as_cluster, check_engine, device_of, open_executor, stage_source
 from warp_ir.cli.frames import TimeCode, outputs_of, time_codes
 from warp_ir.cli.import_guard import importing
 from warp_ir.cli.parts import Part, PartFilm, note_of, part_of, read_film
@@ -32,6 +33,7 @@ from warp_ir.scene import InputError, Scene
 from warp_ir.settings import RenderSettings
 
 if TYPE_CHECKING:
+    from warp_ir.engine import Executor
     from warp_ir.film import Film
     from warp_ir.renderer import Renderer
     from warp_ir.scheduling import Progress
@@ -48,7 +50,7 @@ _IN_SURFACE = 1e-6
 
 
 @dataclass(frozen=True)
-class _Picture:
+class Picture:
     """One render and the files that it is written to."""
 
     time: TimeCode
@@ -59,7 +61,7 @@ class _Picture:
 
 
 @dataclass
-class _Job:
+class Job:
     """What all pictures of a command share."""
 
     args: argparse.Namespace
@@ -68,6 +70,8 @@ class _Job:
     reader: "StageReader"
     view: tuple[str, str] | None
     """OpenColorIO's display and view; None: pictures are tone-mapped."""
+    executor: "Executor | None" = None
+    """What renders the parts of a picture; None: its renderer, which has no parts."""
     films: Sequence[PartFilm] = ()
     """The parts that the picture is made of; none: it is rendered."""
     preview: "FilmPreview | None" = None
@@ -81,6 +85,10 @@ class _Job:
     """Exposure of all pictures [stops]; None: the first one decides, when it is written."""
 
 
+Rendered = tuple[dict[str, Any], int] | None
+"""Statistics of a picture and the exit code; None: it is there already, and an earlier command is continued."""
+
+
 def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
     """Renders the stage's picture, or one for each frame and product; returns the exit code.
 
@@ -88,18 +96,35 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
     """
     # All errors of the command line are reported before anything is loaded.
     part_of(args, settings_of(args))
+    if not films:
+        check_engine(args)
     pictures = []
     into_folder = args.output.endswith(("/", os.sep)) or os.path.isdir(args.output)
     _check_exr_flags(args, into_folder)
     view = _view(args, into_folder)
     if not into_folder:
         outputs = outputs_of(args.output, args.frames, time_code_of(args))
-        pictures = [_Picture(code, None, {path: None}) for code, path in outputs.items()]
+        pictures = [Picture(code, None, {path: None}) for code, path in outputs.items()]
         for path in outputs.values():
             check_output(path, SUFFIXES, make_folder=args.make_output_path)
     if args.stats:
         check_output(args.stats, (".json",), make_folder=args.make_output_path)
-    device = open_device(args.device, verbose=args.verbose)
+    if films:
+        return _render_pictures(args, pictures, view, None, films)
+    with open_executor(args) as executor:
+        return _render_pictures(args, pictures, view, executor)
+
+
+def _render_pictures(
+    args: argparse.Namespace,
+    pictures: Sequence[Picture],
+    view: tuple[str, str] | None,
+    executor: "Executor | None",
+    films: Sequence[PartFilm] = (),
+) -> int:
+    """Renders pictures, by default those of the stage's products; returns the exit code."""
+    name = args.device if films else device_of(args, executor)
+    device = open_device(name, verbose=args.verbose)
     with importing():
         _ = ir.load_usd, ir.Renderer  # imported here, so that the first frame's time does not include it
     versions = _versions()
@@ -115,22 +140,24 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
         reader = open_reader(args)
     opened = time.perf_counter() - args.started - imported
     exposure = None if args.exposure == "auto" else args.exposure
-    job = _Job(args, device, versions, reader, view, films, preview, exposure=exposure)
+    job = Job(args, device, versions, reader, view, executor, films, preview, exposure=exposure)
     if films:
         pictures = [_merged_picture(job)]
-    elif into_folder:
+    elif not pictures:
         pictures = _products(job)
 
+    cluster = as_cluster(executor) if args.shared_files and len(pictures) > 1 else None
+    if cluster is not None:
+        from warp_ir.cli.frame_tasks import render_frames
+
+        results = render_frames(job, cluster, pictures)
+    else:
+        results = _one_by_one(job, pictures)
     frames: list[dict[str, Any]] = []
     code = 0
-    started: float = args.started
-    for number, picture in enumerate(pictures, start=1):
-        path = next(iter(picture.files))
-        label = path.name if len(pictures) == 1 else f"{path.name} ({number}/{len(pictures)})"
-        rendered = _render_picture(job, picture, label, started)
-        started = time.perf_counter()
+    for picture, rendered in results:
         if rendered is None:
-            say(f"{path}: exists and is skipped")
+            say(f"{next(iter(picture.files))}: exists and is skipped")
             continue
         statistics, code = rendered
         if not frames:
@@ -143,6 +170,20 @@ def run(args: argparse.Namespace, films: Sequence[PartFilm] = ()) -> int:
     if args.stats:
         _write_stats(Path(args.stats), job, imported, frames)
     return code
+
+
+def _one_by_one(job: Job, pictures: Sequence[Picture]) -> Iterator[tuple[Picture, Rendered]]:
+    """Renders pictures, one after the other."""
+    started: float = job.args.started
+    for number, picture in enumerate(pictures, start=1):
+        yield picture, render_picture(job, picture, label_of(picture, number, len(pictures)), started)
+        started = time.perf_counter()
+
+
+def label_of(picture: Picture, number: int, count: int) -> str:
+    """What progress calls a picture."""
+    name = next(iter(picture.files)).name
+    return name if count == 1 else f"{name} ({number}/{count})"
 
 
 def _check_exr_flags(args: argparse.Namespace, into_folder: bool) -> None:
@@ -177,7 +218,7 @@ def _view(args: argparse.Namespace, into_folder: bool) -> tuple[str, str] | None
     return check_view(args.ocio_display, args.ocio_view)
 
 
-def _products(job: _Job) -> list[_Picture]:
+def _products(job: Job) -> list[Picture]:
     """The pictures that the stage's RenderProducts ask for, in the user's folder.
 
     Products with the same camera and settings are one render that is written to several files.
@@ -214,11 +255,11 @@ def _products(job: _Job) -> list[_Picture]:
                 group = (product, {})
                 groups.append(group)
             group[1][path] = product.aovs
-        pictures += [_Picture(code, product, files) for product, files in groups]
+        pictures += [Picture(code, product, files) for product, files in groups]
     return pictures
 
 
-def _merged_picture(job: _Job) -> _Picture:
+def _merged_picture(job: Job) -> Picture:
     """The picture that films are parts of.
 
     Raises:
@@ -231,14 +272,11 @@ def _merged_picture(job: _Job) -> _Picture:
     if first.product is not None and first.product not in products:
         raise InputError(f"{first.path}: its RenderProduct {first.product} is no longer there")
     product = None if first.product is None else products[first.product]
-    return _Picture(code, product, {path: None if product is None else product.aovs})
+    return Picture(code, product, {path: None if product is None else product.aovs})
 
 
-def _render_picture(job: _Job, picture: _Picture, label: str, started: float) -> tuple[dict[str, Any], int] | None:
-    """Loads, renders and writes one picture, in the time since `started`; returns its statistics and the exit code.
-
-    None: it is there already, and an earlier command is continued.
-    """
+def render_picture(job: Job, picture: Picture, label: str, started: float) -> Rendered:
+    """Loads, renders and writes one picture, in the time since `started`."""
     args = job.args
     path = next(iter(picture.files))
     preview = job.preview
@@ -294,7 +332,11 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
                 _merge(job.films, film, renderer, fingerprint(scene, renderer.settings))
             else:
                 iterations = None if part is None else part.iterations
-                renderer.render(film, report, started=started, reserve=reserve, iterations=iterations)
+                _render_film(job, picture, film, report, started=started, reserve=reserve, iterations=iterations)
+        except InputError:
+            if not job.films and (saved := checkpoint.keep()):
+                say(f"{saved}: --resume continues from this checkpoint")
+            raise
         except MemoryError as error:
             _say_saved(checkpoint.keep(), checkpoint, f"out of memory: {error}")
             raise
@@ -391,7 +433,23 @@ def _render_picture(job: _Job, picture: _Picture, label: str, started: float) ->
     return statistics, code
 
 
-def _exr_options(job: _Job, picture: _Picture) -> ExrOptions:
+def _render_film(
+    job: Job, picture: Picture, film: "Film", progress: "Callable[[Progress], None]", **limits: Any
+) -> None:
+    """Adds iterations to the film where the flags want them to run; `limits` are those of `Renderer.render`."""
+    assert job.renderer is not None
+    if job.executor is None:
+        job.renderer.render(film, progress, **limits)
+        return
+    from warp_ir.engine import render_parts
+
+    cluster = as_cluster(job.executor)
+    if cluster is not None and job.args.shared_files:
+        cluster.source = stage_source(job.args, picture.time, picture.product)
+    render_parts(job.renderer, job.executor, film, progress, size=job.args.part_iterations, **limits)
+
+
+def _exr_options(job: Job, picture: Picture) -> ExrOptions:
     """How the picture's EXR files are stored; traces the Cryptomattes if there is such a file."""
     args = job.args
     wanted = args.cryptomatte if any(file.suffix.lower() == ".exr" for file in picture.files) else []
@@ -431,7 +489,7 @@ def _count_reused(previous: Sequence[object], current: Sequence[object]) -> int:
     return sum(id(item) in ids for item in current)
 
 
-def _aovs(job: _Job, picture: _Picture, path: Path) -> tuple[str, ...]:
+def _aovs(job: Job, picture: Picture, path: Path) -> tuple[str, ...]:
     """The AOVs to write to a file: those of the command line, else those of the stage if the format has layers."""
     if job.args.aovs or path.suffix.lower() != ".exr":
         return tuple(dict.fromkeys(job.args.aovs))
@@ -440,7 +498,7 @@ def _aovs(job: _Job, picture: _Picture, path: Path) -> tuple[str, ...]:
     return tuple(name for name in from_stage if name != "alpha")  # every .exr has alpha
 
 
-def _picture_key(job: _Job, picture: _Picture, scene: Scene, settings: RenderSettings) -> str:
+def _picture_key(job: Job, picture: Picture, scene: Scene, settings: RenderSettings) -> str:
     """A hash of all that the pixels depend on, by which --resume knows the picture; "" if it cannot be stored."""
     args = job.args
     if not any(can_hold_key(file) for file in picture.files):
@@ -450,7 +508,7 @@ def _picture_key(job: _Job, picture: _Picture, scene: Scene, settings: RenderSet
     return fingerprint(scene, settings, *shown)
 
 
-def _is_finished(job: _Job, picture: _Picture, scene: Scene, settings: RenderSettings, key: str) -> bool:
+def _is_finished(job: Job, picture: Picture, scene: Scene, settings: RenderSettings, key: str) -> bool:
     """Whether all files of a picture are there, of its size, and of its key as far as their formats hold one."""
     height = settings.resolve(scene.camera.aspect).height
     _, _, columns, rows = replace(settings, height=height).pixels()
@@ -506,7 +564,7 @@ def _say_saved(saved: Path | None, checkpoint: Checkpoint, failure: str) -> None
         )
 
 
-def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: bool) -> None:
+def _summarize(job: Job, path: Path, film: "Film", *, written: bool, blank: bool) -> None:
     """Prints the line about a finished picture, and warnings and hints about its values.
 
     A blank picture says nothing about the light that its samples have missed: it has no estimated error.
@@ -532,7 +590,7 @@ def _summarize(job: _Job, path: Path, film: "Film", *, written: bool, blank: boo
             say(f"hint: the picture is very {brightness}; --exposure {stops:g} would correct this, --exposure auto too")
 
 
-def _write_stats(path: Path, job: _Job, imported: float, frames: list[dict[str, Any]]) -> None:
+def _write_stats(path: Path, job: Job, imported: float, frames: list[dict[str, Any]]) -> None:
     """Writes the statistics of all pictures as JSON: as a list `frames`, or at the top level for a single picture."""
     results: dict[str, Any] = {
         "stage": str(job.args.stage),

@@ -21,8 +21,12 @@ def open_reader(args: argparse.Namespace) -> "StageReader":
     with importing():
         from warp_ir.usd.load import StageReader
 
-    return StageReader(
-        args.stage,
+    return StageReader(args.stage, **reader_options(args))
+
+
+def reader_options(args: argparse.Namespace) -> dict[str, Any]:
+    """The keyword arguments of `StageReader` that the flags stand for: plain values."""
+    return dict(
         camera=args.camera,
         eye=args.eye,
         look_at=args.look_at,

@@ -2,9 +2,10 @@
 
 from warp_ir.film import accumulate
 from warp_ir.film.film import Film
+from warp_ir.film.samples import FilmSamples
 from warp_ir.film.storage import read_state
 
 ACCUMULATE_MODULES = (accumulate,)
 """Modules with the kernels that every film needs."""
 
-__all__ = ["ACCUMULATE_MODULES", "Film", "read_state"]
+__all__ = ["ACCUMULATE_MODULES", "Film", "FilmSamples", "read_state"]

@@ -5,7 +5,7 @@ import functools
 import math
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 
@@ -19,7 +19,9 @@ from warp_ir.film.accumulate import FIELDS, FilmData, add_samples, film_arrays, 
 from warp_ir.film.denoise import denoise
 from warp_ir.film.error_estimate import tile_errors
 from warp_ir.film.picture_noise import PictureNoise, tile_sums
+from warp_ir.film.samples import RADIANCE, FilmSamples, merge_rows
 from warp_ir.film.storage import (
+    RECONSTRUCTION,
     FilmFile,
     FilmState,
     check_counts,
@@ -41,8 +43,6 @@ AOV_NAMES = ("direct", "indirect", "albedo", "normal", "position", "depth", "alp
 """Names that `Film.aov` accepts."""
 Image = npt.NDArray[np.float32]
 """[height, width, 3]."""
-_RADIANCE = ("emission", "direct", "indirect")
-"""The fields of `FilmData` that add up to the radiance."""
 _CLEAN_ITERATIONS = 8
 """Iterations from which the mean albedo and normals have less noise than a denoiser would leave in them."""
 
@@ -140,6 +140,7 @@ class Film:
         self._data = new_film_data(width * height, has_emission, sees_lights, launcher)
         self._sees_dome = sees_dome
         self._skipped: npt.NDArray[np.int32] = np.zeros(tile_count(width, height), np.int32)
+        self._skipped_before = np.zeros_like(self._skipped)  # by what came before a film that is a part of another
         self.chosen: npt.NDArray[np.bool_] = np.ones(len(self._skipped), bool)
         """[tiles], whether the next iteration is for a tile of 8 x 8 pixels; row by row."""
         self.tiles: Tiles = all_tiles(width, height, launcher)
@@ -148,7 +149,8 @@ class Film:
     def choose(self, tiles: npt.NDArray[np.bool_]) -> None:
         """Restricts the following iterations to the tiles for which `tiles` [tiles] is true."""
         self.chosen = tiles
-        self.tiles = some_tiles(tiles, self._skipped, self.width, self.height, self._launcher)
+        skipped = self._skipped + self._skipped_before
+        self.tiles = some_tiles(tiles, skipped, self.width, self.height, self._launcher)
 
     @property
     def tile_iterations(self) -> npt.NDArray[np.int32]:
@@ -169,7 +171,7 @@ class Film:
         self.iterations += 1
         if not self.chosen.all():
             self._skipped += ~self.chosen
-            self.tiles.skipped.assign(self._skipped)
+            self.tiles.skipped.assign(self._skipped + self._skipped_before)
 
     @_exclusive
     def merge(self, other: "Film") -> None:
@@ -185,22 +187,8 @@ class Film:
                 raise InputError(f"film: cannot merge a film with {what} and one without")
         if other.iterations == 0:
             return
-        n, m = (film._data.count.numpy().astype(np.float64) for film in (self, other))
-        weight = (m / np.maximum(n + m, 1.0))[:, None]  # of the other film
-        difference = (self._radiance_of(*_RADIANCE) - other._radiance_of(*_RADIANCE)).astype(np.float64).reshape(-1, 3)
-        others = film_arrays(other._data)
-        for name, array in film_arrays(self._data).items():
-            mine, theirs = array.numpy(), others[name].numpy()
-            if name in _RADIANCE:
-                mine = mine + (theirs - mine) * weight[: len(mine)]  # emission may have no rows
-            elif name == "standard_deviation":
-                mine, theirs = (x.astype(np.float64) ** 2 for x in (mine, theirs))
-                mine = np.sqrt(mine * (1.0 - weight) + theirs * weight + weight * (1.0 - weight) * difference**2)
-            elif name == "mesh":
-                mine = np.where(n > 0, mine, theirs)
-            else:
-                mine = mine + theirs
-            array.assign(mine)
+        others = {name: array.numpy() for name, array in film_arrays(other._data).items()}
+        self._add(film_arrays(self._data), None, others)
         if self.reconstruction is not None and other.reconstruction is not None:
             self.reconstruction.merge(other.reconstruction)
         self._noise = None  # it is of one sequence of iterations
@@ -208,6 +196,68 @@ class Film:
         self._skipped += other._skipped
         self.choose(self.chosen)
         self.seconds += other.seconds
+
+    @_exclusive
+    def clear(self, tiles: npt.NDArray[np.bool_], skipped: npt.NDArray[np.int32]) -> None:
+        """Empties the film, so that it takes the samples of a part of a render.
+
+        Args:
+            tiles: The tiles that the following iterations sample, [tiles].
+            skipped: Iterations before them that left out each tile, [tiles].
+        """
+        for array in self._saved_arrays().values():
+            array.zero_()
+        self.iterations, self.timings, self.counts = 0, {}, {}
+        self._skipped, self._skipped_before = np.zeros_like(self._skipped), skipped
+        self._resolved = self._denoised = self._noise = None
+        if np.array_equal(tiles, self.chosen):
+            self.tiles.skipped.assign(skipped)  # the same record, so that launches are repeated
+        else:
+            self.choose(tiles)
+
+    @_exclusive
+    def samples(self) -> FilmSamples:
+        """What its iterations have found, on the host."""
+        arrays = {name: array.numpy() for name, array in self._saved_arrays().items()}
+        seen = arrays["count"] > 0
+        for name in ("count", "unassigned_count"):  # the filter's samples may lie on other pixels
+            seen |= arrays.get(f"{RECONSTRUCTION}{name}", seen) > 0
+        rows = None if seen.all() else np.flatnonzero(seen)
+        values = {
+            name: np.copy(array if rows is None or not len(array) else array[rows]) for name, array in arrays.items()
+        }
+        return FilmSamples(self.iterations, rows, values, dict(self.timings), dict(self.counts))
+
+    @_exclusive
+    def add(self, samples: FilmSamples, iterations: int) -> None:
+        """Adds samples of further iterations of the same picture, which films of other renderers have collected.
+
+        Args:
+            samples: What `samples` has returned there.
+            iterations: Iterations of this film with these samples, and with those that other tiles get from the same.
+        """
+        if samples.iterations:
+            self._add(self._saved_arrays(), samples.rows, samples.arrays)
+        for mine, theirs in ((self.timings, samples.timings), (self.counts, samples.counts)):
+            for key, value in theirs.items():
+                mine[key] = mine.get(key, 0) + value  # type: ignore[assignment]  # seconds, or numbers
+        self.iterations = iterations
+        self._resolved = self._denoised = None
+        self._count_skipped()
+        self.choose(self.chosen)
+
+    def _add(
+        self,
+        arrays: "dict[str, wp.array[Any]]",
+        rows: npt.NDArray[np.intp] | None,
+        others: Mapping[str, npt.NDArray[Any]],
+    ) -> None:
+        """Merges arrays of other iterations, of some pixels or of all, into those of the film."""
+        mine = {name: array.numpy() for name, array in arrays.items()}  # on a CPU these are the arrays themselves
+        merge_rows(mine, rows, others, self._launcher.threads)
+        if not self._launcher.device.is_cpu:
+            for name, array in arrays.items():
+                array.assign(mine[name])
 
     @overload
     def radiance(self) -> npt.NDArray[np.float32]: ...
@@ -310,7 +360,7 @@ class Film:
         if self.settings is not None and self.settings.denoise and self.iterations > 0:
             pictures.append(self._denoise().copy())
         if not pictures:
-            return self._radiance_of(*_RADIANCE)
+            return self._radiance_of(*RADIANCE)
         # The errors of the two filters are hardly correlated: the mean has less error than the better of them.
         return np.asarray(np.mean(pictures, axis=0)) if len(pictures) > 1 else pictures[0]
 
@@ -321,7 +371,7 @@ class Film:
                 if self.reconstruction is not None:
                     albedo, normal, noisy = self._reconstruct(self.reconstruction)[2:]
                 else:
-                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._radiance_of(*_RADIANCE)
+                    albedo, normal, noisy = self.aov("albedo"), self.aov("normal"), self._radiance_of(*RADIANCE)
                 clean = self.reconstruction is not None or self.iterations >= _CLEAN_ITERATIONS
                 limit = None if self.settings is None else self.settings.time_limit
                 picture = denoise(noisy, albedo, normal, clean, limit)
@@ -443,7 +493,7 @@ class Film:
 
         There the picture is made of more camera rays than the mean, so that the difference is no bias.
         """
-        difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*_RADIANCE))
+        difference = np.asarray(self._reconstruct(reconstruction)[:2].sum(axis=0) - self._radiance_of(*RADIANCE))
         return np.where(self._near_emission()[..., None], np.float32(0.0), difference)
 
     @_exclusive
@@ -573,9 +623,13 @@ class Film:
         for name, array in arrays.items():
             array.assign(stored[name])
         self.iterations, self.seconds = file.state.iterations, file.state.seconds
+        self._count_skipped()
+        self.choose(file.state.chosen)
+
+    def _count_skipped(self) -> None:
+        """Counts the iterations that have left out each tile, by those that its first pixel has."""
         count = self._data.count.numpy().reshape(self.height, self.width)
         self._skipped = (self.iterations - count[::TILE, ::TILE]).astype(np.int32).reshape(-1)
-        self.choose(file.state.chosen)
 
     def _radiance_of(self, *names: str) -> npt.NDArray[np.float32]:
         """Sum of some fields of `FilmData`, float32 [height, width, 3]; always a copy."""

@@ -28,7 +28,7 @@ from warp_ir.tiles import TILE, tile_count
 Layout = tuple[str, tuple[int, ...]]
 """Type and shape of an array, such as ("<f4", (100, 3))."""
 
-_RECONSTRUCTION = "reconstruction_"
+RECONSTRUCTION = "reconstruction_"
 """Prefix of the reconstruction's arrays in a file."""
 _NOISE = "noise_"
 """Prefix of the fields of a `PictureNoise`."""
@@ -136,7 +136,7 @@ class FilmFile:
             self.check_layout(name, layout)
         values = {name: self._read(name) for name in layouts}
         for name, array in values.items():
-            signed = name.removeprefix(_RECONSTRUCTION) in _SIGNED
+            signed = name.removeprefix(RECONSTRUCTION) in _SIGNED
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise self.error(f"{name} is not finite")
             if array.size and array.min() < (-1 if name == "mesh" else 0) and not (signed and array.dtype.kind == "f"):
@@ -281,7 +281,7 @@ def check_counts(file: FilmFile, values: Mapping[str, npt.NDArray[Any]], meshes:
     if meshes is not None and values["mesh"].max() >= meshes:
         raise file.error("it shows a mesh that is not there")
     samples = [
-        values[_RECONSTRUCTION + name] for name in ("count", "unassigned_count") if _RECONSTRUCTION + name in values
+        values[RECONSTRUCTION + name] for name in ("count", "unassigned_count") if RECONSTRUCTION + name in values
     ]
     if sum(int(array.sum(dtype=np.int64)) for array in samples) > int(count.sum(dtype=np.int64)):
         raise file.error("its filter has more samples than there are")
@@ -289,4 +289,4 @@ def check_counts(file: FilmFile, values: Mapping[str, npt.NDArray[Any]], meshes:
 
 def reconstruction_names(arrays: Mapping[str, "wp.array[Any]"]) -> dict[str, "wp.array[Any]"]:
     """A reconstruction's arrays under the names that they have in a file."""
-    return {_RECONSTRUCTION + name: array for name, array in arrays.items()}
+    return {RECONSTRUCTION + name: array for name, array in arrays.items()}

@@ -1,6 +1,7 @@
 """The scene on the host: frozen records of NumPy arrays, independent of Warp and USD."""
 
 from warp_ir.scene.camera import CONFORM_POLICIES, MAX_CLIPPING_PLANES, Camera, Projection
+from warp_ir.scene.content import scene_hash
 from warp_ir.scene.measure import materials_of, triangle_areas
 from warp_ir.scene.scene import Scene
 from warp_ir.scene.types import (
@@ -43,5 +44,6 @@ __all__ = [
     "Texture",
     "Wrap",
     "materials_of",
+    "scene_hash",
     "triangle_areas",
 ]
