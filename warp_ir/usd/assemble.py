@@ -27,9 +27,10 @@ from warp_ir.usd.geometry.skinning import Skinning, pose_key
 from warp_ir.usd.geometry.spheres import read_spheres
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue, look_up
+from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef, UVRef
 from warp_ir.usd.lights.mesh_light import LIGHT_UV, MeshLightPrim
 from warp_ir.usd.linking import LightLinks
+from warp_ir.usd.shading.bake import PrimSurface
 from warp_ir.usd.shading.binding import PURPOSES
 from warp_ir.usd.shading.material_table import TRANSPARENT, MaterialAssignment, MaterialTable
 from warp_ir.usd.traverse import MAX_LIGHT_COPIES, DrawnPrim
@@ -285,13 +286,11 @@ class _MeshBuilder:
             amounts = np.zeros(shape.triangles.shape)
             for k in used:
                 value, chosen = self._table.displacements[k], assignment.material == k
-                if value.primvars:
-                    self._report.warn(self._table.materials[k].name, "displacement by primvars takes its fallback")
-                uvs: Floats | None = np.zeros((*shape.triangles.shape, 2))
-                if value.mapping is not None:
-                    uvs = texture_coordinates(prim, shape, value.mapping.uv, self._time, self._report)
-                if uvs is not None:
-                    amounts[chosen] = look_up(value, uvs[chosen])[..., 0]
+                surface = PrimSurface(prim, shape, self._time, self._report)
+                refs = value.reads if value.mapping is None else (UVRef(value.mapping.uv),)
+                corners = {ref: values for ref in refs if (values := surface.corners(ref)) is not None}
+                at = {ref: values if values.ndim == 1 else values[chosen] for ref, values in corners.items()}
+                amounts[chosen] = np.broadcast_to(value.evaluate(at), (*amounts[chosen].shape, 1))[..., 0]
             self._displaced_shapes[key] = displaced(shape, amounts)
         return self._displaced_shapes[key]
 
@@ -328,7 +327,7 @@ class _MeshBuilder:
         if key not in self._colored_levels:
             colors: Floats | None = None
             if level.primvars is not None:
-                by_primvar = {
+                by_primvar: dict[SurfaceRef, Floats | None] = {
                     primvar: level.primvars.read(primvar.name, primvar.channels, self._report)
                     for primvar in albedo.primvars
                 }

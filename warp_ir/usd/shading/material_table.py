@@ -8,9 +8,10 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue
+from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef
+from warp_ir.usd.shading.bake import FACE_TEXELS, FieldOnPrim, PrimSurface, patch_size
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
-from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material
+from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material, with_baked
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh
@@ -87,7 +88,8 @@ class MaterialTable:
         self._time, self._report = time, report
         self._images, self._black_metals = images or ImageCache(report), metals == "black"
         self._images.report = report
-        self._primvar_materials: dict[int, EvaluatedMaterial] = {}
+        self._fields: dict[int, EvaluatedMaterial] = {}
+        self._baked_images: dict[Hashable, ShadingValue] = {}
         self._indices: dict[Material, int] = {}
         self._index_by_path: dict[Sdf.Path, int] = {}
         self._bound_index: dict[Sdf.Path, int] = {}
@@ -103,6 +105,12 @@ class MaterialTable:
             self._indices[material] = len(self.materials)
             self.materials.append(material)
         return self._indices[material]
+
+    def _add_with_fields(self, evaluated: EvaluatedMaterial) -> int:
+        """Index of a material that each prim evaluates for itself; no other material shares it."""
+        self.materials.append(evaluated.material)
+        self._fields[len(self.materials) - 1] = evaluated
+        return len(self.materials) - 1
 
     def resolve(self, prims: Sequence[Usd.Prim]) -> None:
         """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work."""
@@ -131,7 +139,7 @@ class MaterialTable:
             return None
         index = self._bound_index.get(path, UNBOUND)
         if index != UNBOUND:
-            plain = index >= 0 and index not in self._primvar_materials and not self.materials[index].textures
+            plain = index >= 0 and index not in self._fields and not self.materials[index].textures
             return index if plain else None
         if self._authored(prim, "primvars:displayOpacity", authored) is not None:
             return None
@@ -200,12 +208,44 @@ class MaterialTable:
         index = np.full(len(shape.triangles), self._bound_index.get(prim.GetPath(), UNBOUND), dtype=np.int32)
         for faces, bound in self._subsets(prim, shape):
             index[faces[shape.face]] = bound
-        return replace(self._with_primvar_values(prim, shape, index), uvs=self._uvs(prim, shape, index))
+        fields = {int(k): self._fields[k] for k in np.unique(index) if k in self._fields}
+        baked, face_texels = self._baked(prim, shape, fields) if fields else ({}, None)
+        assignment = self._with_primvar_values(prim, shape, index, baked)
+        uvs = self._uvs(prim, shape, index)
+        return replace(assignment, uvs=uvs if face_texels is None else {**uvs, FACE_TEXELS: face_texels})
 
-    def _with_primvar_values(self, prim: Usd.Prim, shape: TriangleMesh, index: Ints) -> MaterialAssignment:
-        """Applies displayColor to unbound triangles, and primvars to the materials that read them."""
+    def _baked(
+        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial]
+    ) -> tuple[dict[int, EvaluatedMaterial], Floats | None]:
+        """Materials whose fields that read more than primvars are textures of this prim, by index.
+
+        Returns:
+            The materials, and the texture coordinates `FACE_TEXELS` if any uses them, float32 [m, 3, 2].
+        """
+        surface = PrimSurface(prim, shape, self._time, self._report)
+        found = {
+            (k, what): FieldOnPrim(value, surface)
+            for k, evaluated in fields.items()
+            for what, value in _fields_to_bake(evaluated).items()
+        }
+        for k, what in [key for key, value in found.items() if key[1] == "normal" and not value.over_uv]:
+            self._report.warn(self.materials[k].name, "a normal map that depends on more than one uv set is left out")
+            del found[k, what]
+        on_faces = [value.field for value in found.values() if not value.over_uv]
+        size = patch_size(on_faces, surface) if on_faces else 0
+        face_texels: Floats | None = None
+        baked = {k: replace(evaluated, normal=None) for k, evaluated in fields.items()}
+        for (k, what), value in found.items():
+            result = value.bake(size, self._baked_images)
+            face_texels = face_texels if result.uvs is None else result.uvs
+            baked[k] = with_baked(baked[k], what, result.value, self._images)
+        return baked, face_texels
+
+    def _with_primvar_values(
+        self, prim: Usd.Prim, shape: TriangleMesh, index: Ints, evaluated: Mapping[int, EvaluatedMaterial]
+    ) -> MaterialAssignment:
+        """Applies displayColor to unbound triangles, and their own values to materials that have fields."""
         bare = index == UNBOUND
-        evaluated = {int(k): self._primvar_materials[k] for k in np.unique(index) if k in self._primvar_materials}
         if not bare.any() and not evaluated:
             return MaterialAssignment(index)
         colors: Floats | None = None
@@ -220,7 +260,7 @@ class MaterialTable:
         )
         for k, surface in evaluated.items():
             chosen = index == k
-            material = self.materials[k]
+            material = surface.material
             color = self._from_primvars(prim, shape, surface.albedo, "albedo", 1.0)
             if color is None and surface.albedo is not None and material.albedo_texture is None:
                 lacking.append((chosen, surface.albedo))
@@ -230,6 +270,8 @@ class MaterialTable:
                     red, green, blue = color.tolist()
                     material = replace(material, albedo=(red, green, blue))
             index[chosen] = self._primvar_variants(prim, shape, surface, material)[chosen]
+            if k in self.displacements:
+                self.displacements.update(dict.fromkeys(np.unique(index[chosen]).tolist(), self.displacements[k]))
             if color is not None and color.ndim > 1:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
@@ -306,7 +348,7 @@ class MaterialTable:
         self, prim: Usd.Prim, shape: TriangleMesh, value: ShadingValue | None, what: str, upper: float
     ) -> Floats | None:
         """A shading value evaluated with the prim's primvars, [c] or [m, 3, c]; None if the prim has none of them."""
-        values = {}
+        values: dict[SurfaceRef, Floats] = {}
         for key in () if value is None else value.primvars:
             corners = primvar.corner_values(prim, shape, key.name, key.channels, self._time, self._report)
             if corners is not None:
@@ -315,7 +357,7 @@ class MaterialTable:
             return None
         result = value.evaluate(values)
         if result.min() < 0.0 or result.max() > upper:
-            names = ", ".join(key.name for key in values)
+            names = ", ".join(key.name for key in value.primvars if key in values)
             self._report.warn(prim.GetPath(), f"{what} of the primvar {names} outside [0, {upper:g}] clamped")
         return result.clip(0.0, upper)
 
@@ -409,12 +451,17 @@ class MaterialTable:
                     displacement = evaluated.displacement or read_displacement(material, self._time, self._images)
                     if displacement is not None:
                         self.displacements[self._index_by_path[path]] = displacement
-                if evaluated is not None and (evaluated.albedo or evaluated.emission or evaluated.opacity):
-                    self._primvar_materials[self._index_by_path[path]] = evaluated
+                if evaluated is not None and evaluated.fields:
+                    self._index_by_path[path] = self._add_with_fields(evaluated)
             except Unreadable as trouble:
                 self._report.warn(material.GetPath(), str(trouble))
                 self._index_by_path[path] = UNBOUND
         return self._index_by_path[path]
+
+
+def _fields_to_bake(evaluated: EvaluatedMaterial) -> dict[str, ShadingValue]:
+    """The fields of a material that read more than primvars, by what they are."""
+    return {what: value for what, value in evaluated.fields.items() if what == "normal" or not value.only_primvars}
 
 
 def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:
