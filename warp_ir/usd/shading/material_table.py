@@ -392,6 +392,8 @@ class MaterialTable:
         names = dict.fromkeys(texture.uv for material in used for texture in material.textures)
         uvs = {}
         for name in names:
+            if name == FACE_TEXELS:
+                continue
             corners = primvar.texture_coordinates(prim, shape, name, self._time, self._report)
             if corners is not None:
                 uvs[name] = corners

@@ -394,7 +394,8 @@ def _evaluated(
     normal: ShadingValue | None,
 ) -> EvaluatedMaterial | None:
     """The evaluated material with an albedo in [0, 1] and a non-negative emission; None: opacity is 0."""
-    if albedo.lowest < 0.0 or albedo.highest > 1.0:
+    rounding = 1e-6 if albedo.reads else 0.0
+    if albedo.lowest < -rounding or albedo.highest > 1.0 + rounding:
         inputs.warn(f"albedo {_value_text(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _clamp01, albedo)
     if emission.highest >= MAX_RADIANCE:
