@@ -143,7 +143,7 @@ class _MeshBuilder:
 
     def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
-        self._table.resolve([drawn.prim for drawn in drawn_prims])
+        self._table.resolve([drawn.prim for drawn in drawn_prims if drawn.draw_mode is None])
         for drawn in drawn_prims:
             if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
                 self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
@@ -236,18 +236,20 @@ class _MeshBuilder:
 
     def _gprim(self, drawn: DrawnPrim) -> _Gprim | None:
         """A gprim without its fully transparent triangles; equal shapes with equal materials are stored once."""
-        full = self._shape(drawn)
+        full = self._shape(drawn) if drawn.draw_mode is None else drawn.draw_mode.shape
         if full is None:
             return None
         mesh_light = self._mesh_light(drawn)
-        plain = (
-            self._table.key(drawn.prim, drawn.authored) if mesh_light is None and drawn.level.parent is None else None
-        )
+        is_plain = mesh_light is None and drawn.level.parent is None and drawn.draw_mode is None
+        plain = self._table.key(drawn.prim, drawn.authored) if is_plain else None
         if plain is not None and (id(full), plain) in self._plain_gprims:
             alike = self._plain_gprims[id(full), plain]
             return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
-        assignment = self._table.assign(drawn.prim, full)
-        full = self._displaced(drawn.prim, full, assignment)
+        if drawn.draw_mode is None:
+            assignment = self._table.assign(drawn.prim, full)
+            full = self._displaced(drawn.prim, full, assignment)
+        else:
+            assignment = self._table.assign_draw_mode(drawn.prim, drawn.draw_mode)
         if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
             corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
             assignment = (

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
+from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material, Wrap
+from warp_ir.usd.geometry.draw_mode import DrawMode
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef
+from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef, UVMapping
 from warp_ir.usd.shading.bake import FACE_TEXELS, FieldOnPrim, PrimSurface, patch_size
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
 from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material, with_baked
@@ -20,6 +21,10 @@ TRANSPARENT = -1
 """Instead of a material index: opacity is 0, so the triangle is dropped."""
 UNBOUND = -2
 """Instead of a material index: no readable material is bound, so displayColor applies."""
+CARD_UV = "warp_ir:card"
+"""Name of the texture coordinates of models that are drawn as cards."""
+_CARD_CUTOFF = 0.1
+"""Opacity below which a card is absent, as in usdview."""
 _TETRAHEDRON = "tetrahedron"
 """Element type of GeomSubsets of a TetMesh's tetrahedra."""
 _MAX_VARIANTS = 2**16
@@ -213,6 +218,39 @@ class MaterialTable:
         assignment = self._with_primvar_values(prim, shape, index, baked)
         uvs = self._uvs(prim, shape, index)
         return replace(assignment, uvs=uvs if face_texels is None else {**uvs, FACE_TEXELS: face_texels})
+
+    def assign_draw_mode(self, prim: Usd.Prim, mode: DrawMode) -> MaterialAssignment:
+        """The colours, or the textures of cards with their opacity, of a model that is drawn as its draw mode."""
+        indices = []
+        for color, attribute in zip(mode.colors, mode.textures, strict=True):
+            material = Material(str(prim.GetPath()), color)
+            try:
+                material = material if attribute is None else self._card(material, attribute)
+            except Unreadable as trouble:
+                self._report.warn(prim.GetPath(), f"{trouble}; the card is of one colour")
+            indices.append(self.add(material))
+        return MaterialAssignment(np.array(indices, np.int32)[mode.shape.face], uvs={CARD_UV: mode.uvs})
+
+    def _card(self, material: Material, attribute: Usd.Attribute) -> Material:
+        """A card's material with the image that an attribute names, absent where it is transparent."""
+        mapping = UVMapping(CARD_UV, wrap=(Wrap.CLAMP, Wrap.CLAMP))
+        textures = []
+        for channels in ([0, 1, 2], [3]):
+            _, pixels, key, _ = self._images.look_up(
+                attribute,
+                self._time,
+                "auto",
+                np.zeros(4),
+                channels,
+                lambda what: self._report.warn(material.name, what),
+            )
+            value = ShadingValue(pixels, np.zeros(len(channels)), mapping, (key, tuple(channels)), attribute.GetName())
+            textures.append(self._images.texture(value))
+        image, alpha = textures
+        material = replace(material, albedo=image.mean, albedo_texture=image)
+        if alpha.pixels.min() >= 1.0:
+            return material
+        return replace(material, opacity=alpha.mean[0], cutoff=_CARD_CUTOFF, opacity_texture=alpha)
 
     def _baked(
         self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial]
