@@ -143,7 +143,12 @@ class _MeshBuilder:
 
     def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
-        self._table.resolve([drawn.prim for drawn in drawn_prims if drawn.draw_mode is None])
+        bare = [drawn for drawn in drawn_prims if drawn.draw_mode is None]
+        self._table.resolve(
+            [drawn.prim for drawn in bare],
+            {drawn.prim.GetPath() for drawn in bare if not drawn.has_children},
+            {drawn.prim.GetPath() for drawn in bare if "material:binding" not in drawn.authored},
+        )
         for drawn in drawn_prims:
             if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
                 self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
@@ -245,6 +250,9 @@ class _MeshBuilder:
         if plain is not None and (id(full), plain) in self._plain_gprims:
             alike = self._plain_gprims[id(full), plain]
             return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
+        if plain is not None and (colored := self._table.assign_color(plain, full)) is not None:
+            gprim = self._plain_gprims[id(full), plain] = _Gprim(drawn, full, colored, False)
+            return gprim
         if drawn.draw_mode is None:
             assignment = self._table.assign(drawn.prim, full)
             full = self._displaced(drawn.prim, full, assignment)

@@ -45,6 +45,8 @@ class DrawnPrim:
     """Transform from the prim to its level, float64 [4, 4]."""
     authored: frozenset[str]
     """Names of the properties that the prim has opinions on; only these are read."""
+    has_children: bool = True
+    """Whether it has children, GeomSubsets among them."""
     geometry_light: Usd.Prim | None = None
     """The GeometryLight whose `geometry` relationship targets this gprim; None: there is none."""
     draw_mode: DrawMode | None = None
@@ -130,6 +132,7 @@ class _Traversal:
         self._unknown_types: dict[Sdf.Path, str] = {}
         self._geometry_lights: list[Usd.Prim] = []
         self._has_draw_modes = False
+        self._imageable: dict[str, bool] = {}
 
     def run(self) -> DrawnPrims:
         """Traverses the stage from its pseudo-root."""
@@ -150,13 +153,16 @@ class _Traversal:
             return []
         own_purpose = "default"
         authored = frozenset(prim.GetAuthoredPropertyNames())  # one call instead of one for each that is not authored
-        if prim.IsA(UsdGeom.Imageable):
-            imageable = UsdGeom.Imageable(prim)
+        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        if schema not in self._imageable:
+            self._imageable[schema] = prim.IsA(UsdGeom.Imageable)
+        if self._imageable[schema]:
             if "visibility" in authored:
-                if read.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
+                if read.text(prim.GetAttribute("visibility"), self._time) == UsdGeom.Tokens.invisible:
                     report.stats["prims_invisible"] += 1
                     return []
             if "purpose" in authored or purpose is None:  # else that of the parent, be it inheritable or the fallback
+                imageable = UsdGeom.Imageable(prim)
                 purpose = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
             own_purpose = purpose.purpose
             if "xformOpOrder" in authored:
@@ -179,10 +185,10 @@ class _Traversal:
                 InstanceLevel(prim.GetPrototype().GetPath(), level, level_from_prim[None]),
                 np.eye(4),
             )
-        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if not schema and prim.GetTypeName() not in ("", *_METADATA_TYPES):
             self._unknown_types[prim.GetPath()] = prim.GetTypeName()
-        drawn = DrawnPrim(prim, level, level_from_prim, authored)
+        children = prim.GetFilteredChildren(_PROTOTYPE_PREDICATE if pending.instancers else _DRAWN_PREDICATE)
+        drawn = DrawnPrim(prim, level, level_from_prim, authored, bool(children))
         if schema == "PointInstancer":
             if not self._in_render_pass(prim):
                 return []
@@ -209,7 +215,6 @@ class _Traversal:
             report.warn(prim.GetPath(), f"light filters are not supported: {name} changes nothing")
         elif prim.HasAPI(UsdLux.LightAPI) or schema == "PluginLight":
             report.warn(prim.GetPath(), f"{schema or prim.GetTypeName()} is not supported: it emits nothing")
-        children = prim.GetFilteredChildren(_PROTOTYPE_PREDICATE if pending.instancers else _DRAWN_PREDICATE)
         if children and "LODRootAPI" in prim.GetAppliedSchemas():
             # LODRootAPI: children are alternatives; a renderer without heuristics draws lod:default:index.
             default_index = read.raw(prim.GetAttribute("lod:default:index"), self._time)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material, Wrap
+from warp_ir.scene import MAX_RADIANCE, Bools, Color, Floats, Ints, Material, Wrap
 from warp_ir.usd.geometry.draw_mode import DrawMode
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef, UVMapping
@@ -100,7 +100,7 @@ class MaterialTable:
         self._bound_index: dict[Sdf.Path, int] = {}
         self._with_subsets: set[Sdf.Path] = set()
         self._color_spaces: dict[Sdf.Path, str] = {}
-        self._plain_colors: dict[tuple[bytes, str], bool] = {}
+        self._plain_colors: dict[tuple[bytes, str], Color | None] = {}
         self._inherited: dict[tuple[Sdf.Path, str], Usd.Attribute | None] = {}
         self._dangling: dict[Sdf.Path, Sdf.Path | None] = {}
 
@@ -117,12 +117,20 @@ class MaterialTable:
         self._fields[len(self.materials) - 1] = evaluated
         return len(self.materials) - 1
 
-    def resolve(self, prims: Sequence[Usd.Prim]) -> None:
-        """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work."""
+    def resolve(
+        self, prims: Sequence[Usd.Prim], childless: Container[Sdf.Path] = (), unbound: Container[Sdf.Path] = ()
+    ) -> None:
+        """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work.
+
+        Args:
+            prims: The prims.
+            childless: Paths of those without children.
+            unbound: Paths of those without an opinion on `material:binding`.
+        """
         gprims = []
         for prim in prims:
             gprims.append(prim)
-            if subsets := material_subsets(prim):
+            if prim.GetPath() not in childless and (subsets := material_subsets(prim)):
                 gprims += subsets
                 self._with_subsets.add(prim.GetPath())
         for prim, bound in zip(gprims, bound_materials(gprims, purposes_to_try(self._purposes)), strict=True):
@@ -131,7 +139,7 @@ class MaterialTable:
                 if purpose and purpose not in self._purposes:
                     self._report.warn(prim.GetPath(), f"only a material of purpose '{purpose}' is bound; it is used")
                 self._bound_index[prim.GetPath()] = self._index_of(material)
-            elif (target := self._dangling_target(prim)) is not None:
+            elif (target := self._dangling_target(prim.GetParent() if prim.GetPath() in unbound else prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the bound material {target} does not exist")
 
     def key(self, prim: Usd.Prim, authored: Container[str]) -> Hashable:
@@ -156,12 +164,31 @@ class MaterialTable:
             return None
         key = bytes(memoryview(values)), self._color_space(color)
         if key not in self._plain_colors:
-            primvar = UsdGeom.Primvar(color)
-            self._plain_colors[key] = bool(
-                primvar.GetInterpolation() == UsdGeom.Tokens.constant and all(0.0 <= x <= 1.0 for x in values[0])
-            )
+            self._plain_colors[key] = self._constant_color(color, values)
         indexed = "primvars:displayColor:indices" in authored or color.GetPrim() != prim
-        return None if indexed or not self._plain_colors[key] else key
+        return None if indexed or self._plain_colors[key] is None else key
+
+    @staticmethod
+    def _constant_color(attribute: Usd.Attribute, values: Vt.Vec3fArray) -> Color | None:
+        """One displayColor in linear Rec. 709; None: it is not constant, in [0, 1], and of a known colour space."""
+        if UsdGeom.Primvar(attribute).GetInterpolation() != UsdGeom.Tokens.constant:
+            return None
+        try:
+            rgb: Floats = np.asarray(values).astype(np.float64)
+            if read.is_color(attribute):
+                rgb = read.to_linear_rec709(attribute, rgb)
+        except Unreadable:
+            return None
+        red, green, blue = rgb[0].tolist()
+        return (red, green, blue) if all(0.0 <= x <= 1.0 for x in (red, green, blue)) else None
+
+    def assign_color(self, key: Hashable, shape: TriangleMesh) -> MaterialAssignment | None:
+        """What `assign` gives prims whose `key` is that of one displayColor; None: it is no such key."""
+        color = self._plain_colors.get(key) if isinstance(key, tuple) else None
+        if color is None:
+            return None
+        index = self.add(Material("displayColor", color))
+        return MaterialAssignment(np.full(len(shape.triangles), index, dtype=np.int32))
 
     def _authored(self, prim: Usd.Prim, name: str, authored: Container[str] | None = None) -> Usd.Attribute | None:
         """The attribute of a prim or, cached, of its nearest ancestor that has a value for it; None: there is none."""
