@@ -511,7 +511,7 @@ def test_curves_and_points(mi, tmp_path):
     radii = np.tile([0.05, 0.05, 0.12, 0.07, 0.1, 0.05, 0.05], (len(strands), 1))
     points = np.concatenate(strands)
     centres, sizes = np.array([(-0.9, 0.25, 0.9), (0.3, 0.4, 1.0), (1.0, 1.3, 0.0)]), (0.25, 0.4, 0.2)
-    lamp = placed(rotation(0, -90.0), (0.0, 2.8, 0.2))
+    lamp, green = placed(rotation(0, -90.0), (0.0, 2.8, 0.2)), rgb(0.3, 0.7, 0.4)
     text = room_usd() + CAMERA % "" + f"""
 def RectLight "Lamp" {{
     {at(lamp)}
@@ -543,7 +543,7 @@ def Points "Balls" {{
         "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(lamp @ np.diag([-0.5, 0.5, -1.0, 1.0])),
                  "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": rgb(12)}},
         "hair": {"type": "bsplinecurve", "filename": f"{tmp_path}/hair.txt", "bsdf": diffuse(rgb(0.8, 0.5, 0.2))},
-        **{f"ball{k}": {"type": "sphere", "center": centre.tolist(), "radius": size, "bsdf": diffuse(rgb(0.3, 0.7, 0.4))}
-           for k, (centre, size) in enumerate(zip(centres, sizes, strict=True))},
+        **{f"ball{k}": {"type": "sphere", "center": centres[k].tolist(), "radius": sizes[k], "bsdf": diffuse(green)}
+           for k in range(3)},
     }  # fmt: skip
     agree(load(tmp_path, text), reference(mi, scene, 3), 3)
