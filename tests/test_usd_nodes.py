@@ -7,6 +7,7 @@ import pytest
 from pxr import Sdf, Usd, UsdShade
 
 from tests.stages import load, material_text, mesh, only_material, warned, write_image
+from warp_ir.scene import Wrap
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, constant, look_up
 from warp_ir.usd.shading import noise
@@ -378,6 +379,22 @@ def test_what_depends_on_the_view_is_named(tmp_path):
     text += node("F", "ND_facingratio_float", kind="float")
     scene = load(tmp_path, pattern(text, more=mesh()))
     assert warned(scene, "/A", "ND_facingratio_float", "Vworld") and only_material(scene).albedo == (0.8, 0.8, 0.8)
+
+
+def test_textures_of_realitykit_and_maya(tmp_path):
+    """RealityKit's image is an image; Maya's file texture corrects its colours, and places it by a node of its own."""
+    write_image(tmp_path / "a.png", np.uint8([[[255, 0, 0, 255], [255, 255, 255, 0]]]))
+    image = "asset inputs:file = @a.png@\n"
+    text = node("X", "ND_RealityKitTexture2D_color3", f'{image} string inputs:u_wrap_mode = "clamp_to_edge"')
+    texture = only_material(load(tmp_path, pattern(text, more=mesh()))).albedo_texture
+    assert texture.wrap == (Wrap.CLAMP, Wrap.REPEAT) and texture.pixels.shape == (1, 2, 3)
+    corrected = "color3f inputs:inColor.connect = </A/I.outputs:out>\n color3f inputs:colorGain = (0.5, 1, 1)"
+    text = node("X", "MayaND_fileTexture_color3", corrected)
+    text += node("I", "ND_image_color3", image + "float2 inputs:texcoord.connect = </A/P.outputs:out>")
+    text += node("P", "MayaND_place2dTexture_vector2", "float2 inputs:repeatUV = (4, 2)", "float2")
+    texture = only_material(load(tmp_path, pattern(text, more=mesh()))).albedo_texture
+    assert texture.pixels[0].tolist() == [[0.5, 0, 0], [0.5, 1, 1]]
+    np.testing.assert_allclose(texture.transform, [[4, 0, 0], [0, 2, 0]], atol=1e-12)
 
 
 def arnold(nodes, more):

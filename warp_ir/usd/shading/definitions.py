@@ -22,6 +22,7 @@ CHANNELS = {
 """Number of channels by type."""
 SPECIAL = (
     "image",
+    "RealityKitTexture2D",
     "hextiledimage",
     "tiledimage",
     "texcoord",

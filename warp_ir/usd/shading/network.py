@@ -53,7 +53,13 @@ _MAX_DEPTH = 64
 _MAX_NODES = 4096
 """Maximum number of nodes per input."""
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
-_MATERIALX_WRAPS = {"constant": Wrap.BLACK, "clamp": Wrap.CLAMP, "periodic": Wrap.REPEAT, "mirror": Wrap.MIRROR}
+_MATERIALX_WRAPS = {
+    **dict.fromkeys(("constant", "clamp_to_border", "clamp_to_zero"), Wrap.BLACK),
+    **dict.fromkeys(("clamp", "clamp_to_edge"), Wrap.CLAMP),
+    **dict.fromkeys(("mirror", "mirrored_repeat"), Wrap.MIRROR),
+    "periodic": Wrap.REPEAT,
+}
+"""Address modes of MaterialX, and wrap modes of RealityKit."""
 _Placement = Callable[[tuple[int, int]], UVMapping]
 """The placement of an image as a function of its number of UDIM tiles (across, up)."""
 _VENDOR_IMAGES = {
@@ -372,7 +378,8 @@ class ShadingNetwork:
         elif name == "creatematrix" and kind.type == "matrix44":
             name = "creatematrix_4"
         if name in OPERATIONS:
-            return self._operation(node, name, kind)
+            value = self._operation(node, name, kind)
+            return select(value, [value.pixels.shape[2] - 1]) if output == "outAlpha" else value
         if kind.definition is not None:
             return self._graph(node, kind, output)
         if isinstance(node, _UsdNode):
@@ -484,10 +491,11 @@ class ShadingNetwork:
         )
 
     def _image(self, node: _Node, kind: NodeKind, output: str) -> ShadingValue:
-        """MaterialX's nodes image and tiledimage."""
+        """MaterialX's nodes image and tiledimage, and RealityKit's image."""
         default = self._constant(node, "default", [0.0] * kind.channels)
         coordinates = self._texture_coordinates(node, "texcoord")
-        modes = [_MATERIALX_WRAPS.get(node.text(f"{axis}addressmode", "periodic"), Wrap.REPEAT) for axis in "uv"]
+        mode = "_wrap_mode" if kind.node == "RealityKitTexture2D" else "addressmode"
+        modes = [_MATERIALX_WRAPS.get(node.text(f"{axis}{mode}", "periodic"), Wrap.REPEAT) for axis in "uv"]
         if kind.node == "tiledimage":
             modes = [Wrap.REPEAT, Wrap.REPEAT]
             factors = ("uvtiling", 1.0), ("uvoffset", 0.0), ("realworldimagesize", 1.0), ("realworldtilesize", 1.0)
@@ -639,6 +647,7 @@ class ShadingNetwork:
         "geompropvalueuniform": _primvar,
         "geomcolor": _geom_color,
         "image": _image,
+        "RealityKitTexture2D": _image,
         "tiledimage": _image,
         "hextiledimage": _hex_tiled_image,
         "texcoord": _geometry,

@@ -240,6 +240,17 @@ def _place_2d(uv: Floats, pivot: Floats, scale: Floats, degrees: Floats, offset:
     return np.where(order > 0.5, divide(rotated(centred - offset, degrees), scale), one) + pivot
 
 
+def _place_in_maya(uv: Floats, repeat: Floats, offset: Floats, radians: Floats) -> Floats:
+    """Texture coordinates turned about the centre, repeated and moved."""
+    return np.asarray((rotated(uv[..., :2] - 0.5, -np.degrees(radians)) + 0.5) * repeat + offset)
+
+
+def _file_in_maya(color: Floats, gain: Floats, offset: Floats, exposure: Floats, inverts: Floats) -> Floats:
+    """The colour correction of Maya's file textures."""
+    rgb = np.where(inverts != 0.0, 1.0 - color, color)[..., :3] * 2.0**exposure * gain[..., :3] + offset[..., :3]
+    return _joined(rgb, color[..., 3:])
+
+
 _XYZ_TO_RGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 
 
@@ -486,6 +497,24 @@ OPERATIONS: dict[str, Operation] = {
     "splitlr": Operation({**_LR, **_CENTER}, lambda a, b, middle, uv: np.where(uv[..., :1] >= middle, b, a)),
     "splittb": Operation({**_TB, **_CENTER}, lambda a, b, middle, uv: np.where(uv[..., 1:2] >= middle, a, b)),
     "normalmap": Operation({"in": (0.5, 0.5, 1.0), "scale": (1.0,)}, unpacked_normal),
+    # Of RealityKit and Maya, which write them into stages with MaterialX's nodes.
+    "normal_map_decode": Operation({"in": (0.5, 0.5, 1.0)}, lambda a: 2.0 * a - 1.0),
+    "MayaND_place2dTexture": Operation(
+        {"uvCoord": UV, "repeatUV": (1.0, 1.0), "offset": (0.0, 0.0), "rotateUV": (0.0,)}, _place_in_maya
+    ),
+    "MayaND_fileTexture": Operation(
+        {
+            "inColor": (0.0,),
+            "colorGain": (1.0,) * 3,
+            "colorOffset": (0.0,) * 3,
+            "exposure": (0.0,),
+            "invert": (0.0,),
+        },
+        _file_in_maya,
+    ),
+    "MayaND_clamp": Operation(
+        {"input": (0.0,), "min": (0.0,), "max": (1.0,)}, lambda a, b, c: np.minimum(np.maximum(a, b), c)
+    ),
     **_noises("2d", "texcoord", UV),
     **_noises("3d", "position", POSITION),
 }

@@ -199,7 +199,7 @@ class _NetworkInputs:
             if not UsdShade.Output.IsOutput(producer):
                 return None
             node = str(UsdShade.Shader(producer.GetPrim()).GetShaderId() or "an unnamed node")
-            if not node.startswith(("ND_normalmap", "ND_gltf_normalmap")):
+            if not node.startswith(("ND_normalmap", "ND_gltf_normalmap", "ND_normal_map_decode")):
                 self.warn(
                     f"{name}: the node {node} is not supported, only normalmap is; the surface's own normals are used"
                 )
