@@ -1,5 +1,6 @@
 """Gprims to meshes: each shape is read once, gets its materials, and is instanced or copied to all its transforms."""
 
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux
 from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
 from warp_ir.usd.geometry.curves import CURVES, read_curves
-from warp_ir.usd.geometry.detail import PixelSize
+from warp_ir.usd.geometry.detail import PixelSize, pixels_per_unit
 from warp_ir.usd.geometry.displacement import displaced
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
@@ -150,7 +151,7 @@ class _MeshBuilder:
             {drawn.prim.GetPath() for drawn in bare if "material:binding" not in drawn.authored},
         )
         for drawn in drawn_prims:
-            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
+            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED or self._table.has_fields(drawn.prim):
                 self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
@@ -254,7 +255,11 @@ class _MeshBuilder:
             gprim = self._plain_gprims[id(full), plain] = _Gprim(drawn, full, colored, False)
             return gprim
         if drawn.draw_mode is None:
-            assignment = self._table.assign(drawn.prim, full)
+            density = math.inf
+            if self._table.has_fields(drawn.prim):
+                places = np.concatenate(self._places[_shared_path(drawn.prim)])
+                density = float(pixels_per_unit(self._pixel, full.points, places).max())
+            assignment = self._table.assign(drawn.prim, full, density)
             full = self._displaced(drawn.prim, full, assignment)
         else:
             assignment = self._table.assign_draw_mode(drawn.prim, drawn.draw_mode)

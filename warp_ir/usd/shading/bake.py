@@ -38,12 +38,14 @@ _COARSE = 0.02
 """Mean error from which a warning says that the largest texture is too coarse."""
 _MIN_SIDE, _MAX_SIDE = 64, 2048
 """Smallest and largest side of an image over texture coordinates, in texels."""
-_MAX_FACE_TEXELS = 2**22
+MAX_FACE_TEXELS = 2**22
 """Largest number of texels of an image with a patch for each triangle."""
 _WHOLE = 4.0
 """Texture coordinates that span at most this are rounded to whole numbers, so that more prims share an image."""
 _PROBES = 2048
 """Number of points at which the error is estimated."""
+_FACE_PROBES = 512
+"""The same for images with a patch for each triangle."""
 _CHUNK = 2**17
 """Number of points that are evaluated at a time, which limits the memory."""
 
@@ -234,13 +236,21 @@ def _warn_if_coarse(surface: PrimSurface, error: float, size: str) -> None:
         surface.report.warn(surface.prim.GetPath(), f"a pattern of its material is finer than the {size} texels for it")
 
 
-def patch_size(fields: list[ShadingValue], surface: PrimSurface) -> int:
-    """Texels along an edge of the triangles' patches, 2 or more, with which fields are fine enough on a prim."""
+def patch_size(fields: list[ShadingValue], surface: PrimSurface, density: float, most: int) -> int:
+    """Texels along an edge of the triangles' patches, 2 or more, with which fields are fine enough on a prim.
+
+    Args:
+        fields: The fields.
+        surface: The prim.
+        density: Texels per unit of the prim's space beyond which the picture shows no difference.
+        most: Largest number of texels.
+    """
     count = len(surface.areas)
     rng = np.random.default_rng(3)
     total = surface.areas.sum()
-    chosen = rng.choice(count, _PROBES, p=surface.areas / total if total > 0.0 else None)
-    xy = rng.random((_PROBES, 2))
+    chosen = rng.choice(count, _FACE_PROBES, p=surface.areas / total if total > 0.0 else None)
+    seen = density * math.sqrt(2.0 * float(np.quantile(surface.areas[chosen], 0.9)))
+    xy = rng.random((_FACE_PROBES, 2))
     xy = np.where(xy.sum(axis=1, keepdims=True) > 1.0, 1.0 - xy, xy)
     size, error, unit = 2, math.inf, 1.0
     while True:
@@ -261,14 +271,16 @@ def patch_size(fields: list[ShadingValue], surface: PrimSurface) -> int:
                 weight = np.prod(np.where(corner, t, 1.0 - t), axis=-1, keepdims=True)
                 interpolated = interpolated + weight * at((below + corner) / (size - 1))
             error = max(error, float(np.abs(interpolated - exact).mean()) / unit)
-        if error <= _ERROR or _texels(count, 2 * size) > _MAX_FACE_TEXELS:
+        if error <= _ERROR or size >= seen:
+            break
+        if texels(count, 2 * size) > min(most, MAX_FACE_TEXELS):
+            _warn_if_coarse(surface, error, f"{texels(count, size)}")
             break
         size *= 2
-    _warn_if_coarse(surface, error, f"{_texels(count, size)}")
     return size
 
 
-def _texels(triangles: int, size: int) -> int:
+def texels(triangles: int, size: int) -> int:
     """Texels of the patches of triangles: two triangles share (n + 1) by (n + 2) texels."""
     return -(-triangles // 2) * (size + 1) * (size + 2)
 

@@ -1,5 +1,6 @@
 """The material of each triangle, from bindings, GeomSubsets and displayColor, in one table without duplicates."""
 
+import math
 from collections.abc import Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,8 +10,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 from warp_ir.scene import MAX_RADIANCE, Bools, Color, Floats, Ints, Material, Wrap
 from warp_ir.usd.geometry.draw_mode import DrawMode
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef, UVMapping
-from warp_ir.usd.shading.bake import FACE_TEXELS, FieldOnPrim, PrimSurface, patch_size
+from warp_ir.usd.images.shading_value import PointRef, PrimvarRef, ShadingValue, SurfaceRef, UVMapping
+from warp_ir.usd.shading.bake import FACE_TEXELS, FieldOnPrim, PrimSurface, patch_size, texels
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
 from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material, with_baked
 from warp_ir.usd.values import primvar, read
@@ -27,6 +28,8 @@ _CARD_CUTOFF = 0.1
 """Opacity below which a card is absent, as in usdview."""
 _TETRAHEDRON = "tetrahedron"
 """Element type of GeomSubsets of a TetMesh's tetrahedra."""
+_MAX_FACE_TEXELS = 2**26
+"""Texels of all images with a patch for each triangle; a prim may have an eighth of those that are left."""
 _MAX_VARIANTS = 2**16
 """Maximum number of materials that the primvars of one prim create; beyond it, the mean is used."""
 
@@ -95,6 +98,8 @@ class MaterialTable:
         self._images.report = report
         self._fields: dict[int, EvaluatedMaterial] = {}
         self._baked_images: dict[Hashable, ShadingValue] = {}
+        self._baked_prims: dict[Hashable, tuple[dict[int, EvaluatedMaterial], Floats | None]] = {}
+        self._face_texels_left = _MAX_FACE_TEXELS
         self._indices: dict[Material, int] = {}
         self._index_by_path: dict[Sdf.Path, int] = {}
         self._bound_index: dict[Sdf.Path, int] = {}
@@ -235,13 +240,24 @@ class MaterialTable:
         self._dangling.update(dict.fromkeys(chain, target))
         return target
 
-    def assign(self, prim: Usd.Prim, shape: TriangleMesh) -> MaterialAssignment:
-        """The materials and colours of a prim's triangles; the prim must have been passed to `resolve`."""
+    def has_fields(self, prim: Usd.Prim) -> bool:
+        """Whether materials of a prim may have to be evaluated for it, as finely as the picture shows it."""
+        path = prim.GetPath()
+        return bool(self._fields) and (path in self._with_subsets or self._bound_index.get(path) in self._fields)
+
+    def assign(self, prim: Usd.Prim, shape: TriangleMesh, density: float = math.inf) -> MaterialAssignment:
+        """The materials and colours of a prim's triangles.
+
+        Args:
+            prim: The prim, which must have been passed to `resolve`.
+            shape: Its triangles.
+            density: Pixels of the picture per unit of its space.
+        """
         index = np.full(len(shape.triangles), self._bound_index.get(prim.GetPath(), UNBOUND), dtype=np.int32)
         for faces, bound in self._subsets(prim, shape):
             index[faces[shape.face]] = bound
         fields = {int(k): self._fields[k] for k in np.unique(index) if k in self._fields}
-        baked, face_texels = self._baked(prim, shape, fields) if fields else ({}, None)
+        baked, face_texels = self._baked_for(prim, shape, fields, density) if fields else ({}, None)
         assignment = self._with_primvar_values(prim, shape, index, baked)
         uvs = self._uvs(prim, shape, index)
         return replace(assignment, uvs=uvs if face_texels is None else {**uvs, FACE_TEXELS: face_texels})
@@ -279,8 +295,21 @@ class MaterialTable:
             return material
         return replace(material, opacity=alpha.mean[0], cutoff=_CARD_CUTOFF, opacity_texture=alpha)
 
+    def _baked_for(
+        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial], density: float
+    ) -> tuple[dict[int, EvaluatedMaterial], Floats | None]:
+        """`_baked`, cached for the instances of a prim unless it reads what they may inherit."""
+        reads = {ref for evaluated in fields.values() for value in evaluated.fields.values() for ref in value.reads}
+        if any(isinstance(ref, PrimvarRef) or ref == PointRef("transform") for ref in reads):
+            return self._baked(prim, shape, fields, density)
+        path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        key = (path, id(shape), tuple(fields))
+        if key not in self._baked_prims:
+            self._baked_prims[key] = self._baked(prim, shape, fields, density)
+        return self._baked_prims[key]
+
     def _baked(
-        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial]
+        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial], density: float
     ) -> tuple[dict[int, EvaluatedMaterial], Floats | None]:
         """Materials whose fields that read more than primvars are textures of this prim, by index.
 
@@ -297,7 +326,8 @@ class MaterialTable:
             self._report.warn(self.materials[k].name, "a normal map that depends on more than one uv set is left out")
             del found[k, what]
         on_faces = [value.field for value in found.values() if not value.over_uv]
-        size = patch_size(on_faces, surface) if on_faces else 0
+        size = patch_size(on_faces, surface, density, self._face_texels_left // 8) if on_faces else 0
+        self._face_texels_left -= texels(len(shape.triangles), size) * len(on_faces)
         face_texels: Floats | None = None
         baked = {k: replace(evaluated, normal=None) for k, evaluated in fields.items()}
         for (k, what), value in found.items():
