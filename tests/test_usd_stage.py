@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.stages import TRIANGLE, load, need_real_files, real_file_parameters, warned
+from tests.stages import TRIANGLE, load, need_real_files, only_material, real_file_parameters, warned, write_image
 from warp_ir import InputError, LightKind, load_usd
 
 
@@ -203,18 +203,54 @@ def test_only_the_default_level_of_detail_is_drawn(tmp_path):
     assert [mesh.name for mesh in scene.meshes] == ["/L/Fine"]
 
 
-def test_draw_modes_are_named_and_ignored(tmp_path):
-    """Cards, bounds and origins stand in for geometry in viewers; a renderer draws the geometry."""
-    text = """def Xform "%s" (prepend apiSchemas = ["GeomModelAPI"]) {
-    uniform token model:drawMode = "%s"
-    def Cube "C" {
-    }
-}
+def draw_mode(mode, more="", kind="component"):
+    return f"""def Xform "A" (
+    prepend apiSchemas = ["GeomModelAPI"]
+    kind = "{kind}"
+) {{
+    uniform token model:drawMode = "{mode}"
+    {more}
+    def Cube "C" {{
+    }}
+}}
 """
-    instancer = (text % ("P", "bounds")).replace("Xform", "PointInstancer")
-    scene = load(tmp_path, text % ("A", "cards") + text % ("B", "default") + instancer)
-    assert len(scene.meshes) == 2 and warned(scene, "/A", "cards") and not warned(scene, "/B")
-    assert warned(scene, "/P", "bounds")
+
+
+def test_draw_modes_apply_to_components(tmp_path):
+    """Models that are no components, or say so, are drawn themselves; so are prims that are no models."""
+    assert len(load(tmp_path, draw_mode("bounds", kind="group")).meshes[0].triangles) == 12
+    assert len(load(tmp_path, draw_mode("bounds", "uniform bool model:applyDrawMode = 0")).meshes[0].triangles) == 12
+    assert len(load(tmp_path, draw_mode("default")).meshes[0].triangles) == 12
+    assert len(load(tmp_path, draw_mode("bounds", "uniform bool model:applyDrawMode = 1", "group")).meshes) == 1
+    scene = load(tmp_path, draw_mode("cards", 'uniform token model:cardGeometry = "fromTexture"'))
+    assert warned(scene, "/A", "fromTexture") and scene.meshes[0].name == "/A/C"
+
+
+def test_bounds_and_origin_are_lines(tmp_path):
+    """Twelve edges around the box, in the colour of the draw mode; three axes in red, green and blue."""
+    scene = load(tmp_path, draw_mode("bounds", "uniform float3 model:drawModeColor = (0.25, 0.5, 0.75)"))
+    half = 1.0 + 12**0.5 / 500
+    assert len(scene.meshes[0].triangles) == 12 * 12 and only_material(scene).albedo == (0.25, 0.5, 0.75)
+    np.testing.assert_allclose(
+        [scene.meshes[0].points.min(0), scene.meshes[0].points.max(0)], [[-half] * 3, [half] * 3]
+    )
+    scene = load(tmp_path, draw_mode("origin"))
+    albedos = [scene.materials[k].albedo for k in np.unique(scene.meshes[0].material)]
+    assert sorted(albedos) == [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("geometry, places", [("cross", (0.0, 0.0)), ("box", (-1.0, 1.0))])
+def test_cards_have_the_textures_of_their_faces(tmp_path, geometry, places):
+    """Two quads across X, back to back or on the box; seen from +X the image has Z up and Y to the right."""
+    write_image(tmp_path / "a.png", np.uint8([[[255, 0, 0, 255], [0, 255, 0, 255]], [[0, 0, 255, 255], [9, 9, 9, 0]]]))
+    more = f'asset model:cardTextureXPos = @a.png@\n uniform token model:cardGeometry = "{geometry}"'
+    scene = load(tmp_path, draw_mode("cards", more))
+    shape, material = scene.meshes[0], only_material(scene)
+    assert len(shape.triangles) == 4 and material.cutoff == 0.1 and material.opacity_texture is not None
+    corners, uvs = shape.points[shape.triangles].reshape(4, 3, 3), shape.uvs[material.albedo_texture.uv]
+    x = corners[..., 0].mean(axis=1)
+    np.testing.assert_allclose([x.min(), x.max()], places, atol=1e-3)
+    np.testing.assert_allclose(uvs[x == x.max()], (corners[x == x.max()][..., 1:] + 1) / 2, atol=1e-6)
 
 
 def test_types_that_are_not_rendered_are_named_once_with_their_count(tmp_path):

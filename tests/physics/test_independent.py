@@ -497,3 +497,53 @@ def RectLight "Lamp" {{
                  "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": rgb(9)}},
     }  # fmt: skip
     agree(load(tmp_path, text), reference(mi, scene, 2), 2)
+
+
+def test_curves_and_points(mi, tmp_path):
+    """Tubes along B-splines, of a width that changes, and spheres of three sizes; tubes end in the floor."""
+    rng = np.random.default_rng(8)
+    strands = []
+    for k in range(5):
+        foot, across = np.array([-1.2 + 0.5 * k, -0.4, -0.6 + 0.25 * k]), rng.uniform(-0.4, 0.4, (3, 3))
+        heights = np.array([[0.6], [1.2], [0.7]])
+        arch = foot + np.array([[0.1, 0, 0.1], [0.4, 0, 0.2], [0.7, 0, 0.3]]) + across * (1, 0, 1) + heights * (0, 1, 0)
+        strands.append(np.concatenate([[foot] * 2, arch, [arch[-1] * (1, 0, 1) + (0, -0.4, 0)] * 2]))
+    radii = np.tile([0.05, 0.05, 0.12, 0.07, 0.1, 0.05, 0.05], (len(strands), 1))
+    points = np.concatenate(strands)
+    centres, sizes = np.array([(-0.9, 0.25, 0.9), (0.3, 0.4, 1.0), (1.0, 1.3, 0.0)]), (0.25, 0.4, 0.2)
+    lamp, green = placed(rotation(0, -90.0), (0.0, 2.8, 0.2)), rgb(0.3, 0.7, 0.4)
+    text = room_usd() + CAMERA % "" + f"""
+def RectLight "Lamp" {{
+    {at(lamp)}
+    float inputs:intensity = 12
+}}
+def BasisCurves "Hair" {{
+    uniform token type = "cubic"
+    uniform token basis = "bspline"
+    uniform token wrap = "nonperiodic"
+    int[] curveVertexCounts = {[7] * len(strands)}
+    point3f[] points = {usd(points)}
+    float[] widths = {(2.0 * radii).ravel().tolist()} (interpolation = "vertex")
+    color3f[] primvars:displayColor = [(0.8, 0.5, 0.2)]
+}}
+def Points "Balls" {{
+    point3f[] points = {usd(centres)}
+    float[] widths = {[2.0 * size for size in sizes]} (interpolation = "vertex")
+    color3f[] primvars:displayColor = [(0.3, 0.7, 0.4)]
+}}
+"""  # fmt: skip
+    rows = [
+        "\n".join(f"{x} {y} {z} {r}" for (x, y, z), r in zip(strand, radius, strict=True))
+        for strand, radius in zip(strands, radii, strict=True)
+    ]
+    (tmp_path / "hair.txt").write_text("\n\n".join(rows) + "\n")
+    scene = {
+        **room_mi(mi),
+        "sensor": sensor(mi),
+        "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(lamp @ np.diag([-0.5, 0.5, -1.0, 1.0])),
+                 "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": rgb(12)}},
+        "hair": {"type": "bsplinecurve", "filename": f"{tmp_path}/hair.txt", "bsdf": diffuse(rgb(0.8, 0.5, 0.2))},
+        **{f"ball{k}": {"type": "sphere", "center": centres[k].tolist(), "radius": sizes[k], "bsdf": diffuse(green)}
+           for k in range(3)},
+    }  # fmt: skip
+    agree(load(tmp_path, text), reference(mi, scene, 3), 3)

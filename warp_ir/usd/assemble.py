@@ -1,5 +1,6 @@
 """Gprims to meshes: each shape is read once, gets its materials, and is instanced or copied to all its transforms."""
 
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux
 from warp_ir.scene import Bools, Floats, Instances, Ints, Material, Mesh
 from warp_ir.scene.instances import areas_of_copies
 from warp_ir.usd.geometry.curves import CURVES, read_curves
-from warp_ir.usd.geometry.detail import PixelSize
+from warp_ir.usd.geometry.detail import PixelSize, pixels_per_unit
 from warp_ir.usd.geometry.displacement import displaced
 from warp_ir.usd.geometry.implicit import IMPLICIT, read_implicit
 from warp_ir.usd.geometry.instancing import InstanceLevel, nested_colors, nested_transforms
@@ -27,9 +28,10 @@ from warp_ir.usd.geometry.skinning import Skinning, pose_key
 from warp_ir.usd.geometry.spheres import read_spheres
 from warp_ir.usd.geometry.tangents import smooth_tangents
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue, look_up
+from warp_ir.usd.images.shading_value import ShadingValue, SurfaceRef, UVRef
 from warp_ir.usd.lights.mesh_light import LIGHT_UV, MeshLightPrim
 from warp_ir.usd.linking import LightLinks
+from warp_ir.usd.shading.bake import PrimSurface
 from warp_ir.usd.shading.binding import PURPOSES
 from warp_ir.usd.shading.material_table import TRANSPARENT, MaterialAssignment, MaterialTable
 from warp_ir.usd.traverse import MAX_LIGHT_COPIES, DrawnPrim
@@ -142,9 +144,14 @@ class _MeshBuilder:
 
     def run(self, drawn_prims: Sequence[DrawnPrim], times: int) -> Geometry:
         """Builds all meshes and prototypes."""
-        self._table.resolve([drawn.prim for drawn in drawn_prims])
+        bare = [drawn for drawn in drawn_prims if drawn.draw_mode is None]
+        self._table.resolve(
+            [drawn.prim for drawn in bare],
+            {drawn.prim.GetPath() for drawn in bare if not drawn.has_children},
+            {drawn.prim.GetPath() for drawn in bare if "material:binding" not in drawn.authored},
+        )
         for drawn in drawn_prims:
-            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED:
+            if drawn.prim.GetPrimTypeInfo().GetSchemaTypeName() in _DETAILED or self._table.has_fields(drawn.prim):
                 self._places.setdefault(_shared_path(drawn.prim), []).append(drawn.matrices)
         gprims = [gprim for drawn in drawn_prims if (gprim := self._gprim(drawn)) is not None]
         parts = [InstancedGprim(g.drawn.level, len(g.shape.triangles), self._signature(g), g.emits) for g in gprims]
@@ -235,18 +242,27 @@ class _MeshBuilder:
 
     def _gprim(self, drawn: DrawnPrim) -> _Gprim | None:
         """A gprim without its fully transparent triangles; equal shapes with equal materials are stored once."""
-        full = self._shape(drawn)
+        full = self._shape(drawn) if drawn.draw_mode is None else drawn.draw_mode.shape
         if full is None:
             return None
         mesh_light = self._mesh_light(drawn)
-        plain = (
-            self._table.key(drawn.prim, drawn.authored) if mesh_light is None and drawn.level.parent is None else None
-        )
+        is_plain = mesh_light is None and drawn.level.parent is None and drawn.draw_mode is None
+        plain = self._table.key(drawn.prim, drawn.authored) if is_plain else None
         if plain is not None and (id(full), plain) in self._plain_gprims:
             alike = self._plain_gprims[id(full), plain]
             return _Gprim(drawn, alike.shape, alike.assignment, alike.emits)
-        assignment = self._table.assign(drawn.prim, full)
-        full = self._displaced(drawn.prim, full, assignment)
+        if plain is not None and (colored := self._table.assign_color(plain, full)) is not None:
+            gprim = self._plain_gprims[id(full), plain] = _Gprim(drawn, full, colored, False)
+            return gprim
+        if drawn.draw_mode is None:
+            density = math.inf
+            if self._table.has_fields(drawn.prim):
+                places = np.concatenate(self._places[_shared_path(drawn.prim)])
+                density = float(pixels_per_unit(self._pixel, full.points, places).max())
+            assignment = self._table.assign(drawn.prim, full, density)
+            full = self._displaced(drawn.prim, full, assignment)
+        else:
+            assignment = self._table.assign_draw_mode(drawn.prim, drawn.draw_mode)
         if mesh_light is not None and mesh_light.textured and LIGHT_UV not in assignment.uvs:
             corners = texture_coordinates(drawn.prim, full, LIGHT_UV, self._time, self._report)
             assignment = (
@@ -285,13 +301,11 @@ class _MeshBuilder:
             amounts = np.zeros(shape.triangles.shape)
             for k in used:
                 value, chosen = self._table.displacements[k], assignment.material == k
-                if value.primvars:
-                    self._report.warn(self._table.materials[k].name, "displacement by primvars takes its fallback")
-                uvs: Floats | None = np.zeros((*shape.triangles.shape, 2))
-                if value.mapping is not None:
-                    uvs = texture_coordinates(prim, shape, value.mapping.uv, self._time, self._report)
-                if uvs is not None:
-                    amounts[chosen] = look_up(value, uvs[chosen])[..., 0]
+                surface = PrimSurface(prim, shape, self._time, self._report)
+                refs = value.reads if value.mapping is None else (UVRef(value.mapping.uv),)
+                corners = {ref: values for ref in refs if (values := surface.corners(ref)) is not None}
+                at = {ref: values if values.ndim == 1 else values[chosen] for ref, values in corners.items()}
+                amounts[chosen] = np.broadcast_to(value.evaluate(at), (*amounts[chosen].shape, 1))[..., 0]
             self._displaced_shapes[key] = displaced(shape, amounts)
         return self._displaced_shapes[key]
 
@@ -328,7 +342,7 @@ class _MeshBuilder:
         if key not in self._colored_levels:
             colors: Floats | None = None
             if level.primvars is not None:
-                by_primvar = {
+                by_primvar: dict[SurfaceRef, Floats | None] = {
                     primvar: level.primvars.read(primvar.name, primvar.channels, self._report)
                     for primvar in albedo.primvars
                 }

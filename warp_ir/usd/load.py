@@ -47,6 +47,7 @@ _STATS = (
     "prims_invisible",
     "prims_other_purpose",
     "prims_outside_pass",
+    "draw_modes",
     "degenerate_faces",
     "triangles_absent",
     "unused_materials",

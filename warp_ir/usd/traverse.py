@@ -9,6 +9,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from warp_ir.scene import Floats
 from warp_ir.usd.geometry.curves import CURVES
+from warp_ir.usd.geometry.draw_mode import DrawMode, draw_mode, read_draw_mode
 from warp_ir.usd.geometry.implicit import IMPLICIT
 from warp_ir.usd.geometry.instancing import InstanceLevel, read_instancer
 from warp_ir.usd.lights.light import LIGHTS
@@ -44,8 +45,12 @@ class DrawnPrim:
     """Transform from the prim to its level, float64 [4, 4]."""
     authored: frozenset[str]
     """Names of the properties that the prim has opinions on; only these are read."""
+    has_children: bool = True
+    """Whether it has children, GeomSubsets among them."""
     geometry_light: Usd.Prim | None = None
     """The GeometryLight whose `geometry` relationship targets this gprim; None: there is none."""
+    draw_mode: DrawMode | None = None
+    """What stands in for the geometry of a model; None: the prim is a gprim."""
 
     @property
     def matrices(self) -> Floats:
@@ -126,6 +131,8 @@ class _Traversal:
         self._drawn = DrawnPrims()
         self._unknown_types: dict[Sdf.Path, str] = {}
         self._geometry_lights: list[Usd.Prim] = []
+        self._has_draw_modes = False
+        self._imageable: dict[str, bool] = {}
 
     def run(self) -> DrawnPrims:
         """Traverses the stage from its pseudo-root."""
@@ -146,31 +153,42 @@ class _Traversal:
             return []
         own_purpose = "default"
         authored = frozenset(prim.GetAuthoredPropertyNames())  # one call instead of one for each that is not authored
-        if prim.IsA(UsdGeom.Imageable):
-            imageable = UsdGeom.Imageable(prim)
+        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
+        if schema not in self._imageable:
+            self._imageable[schema] = prim.IsA(UsdGeom.Imageable)
+        if self._imageable[schema]:
             if "visibility" in authored:
-                if read.text(imageable.GetVisibilityAttr(), self._time) == UsdGeom.Tokens.invisible:
+                if read.text(prim.GetAttribute("visibility"), self._time) == UsdGeom.Tokens.invisible:
                     report.stats["prims_invisible"] += 1
                     return []
             if "purpose" in authored or purpose is None:  # else that of the parent, be it inheritable or the fallback
+                imageable = UsdGeom.Imageable(prim)
                 purpose = imageable.ComputePurposeInfo(purpose) if purpose else imageable.ComputePurposeInfo()
             own_purpose = purpose.purpose
             if "xformOpOrder" in authored:
                 level, level_from_prim = self._transformed(prim, level, level_from_prim, pending.origin)
+        if "model:drawMode" in authored:
+            self._has_draw_modes = True
+        if self._has_draw_modes and (mode := draw_mode(prim)):
+            try:
+                stand_in = read_draw_mode(prim, mode, self._time)
+            except Unreadable as trouble:
+                report.warn(prim.GetPath(), f"draw mode '{mode}': {trouble}; the geometry itself is drawn")
+            else:
+                report.stats["draw_modes"] += 1
+                if self._is_drawn(prim, own_purpose):
+                    self._drawn.gprims.append(DrawnPrim(prim, level, level_from_prim, authored, draw_mode=stand_in))
+                return []
         if prim.IsInstance():
             report.stats["native_instances"] += 1
             level, level_from_prim = (
                 InstanceLevel(prim.GetPrototype().GetPath(), level, level_from_prim[None]),
                 np.eye(4),
             )
-        schema = prim.GetPrimTypeInfo().GetSchemaTypeName()
         if not schema and prim.GetTypeName() not in ("", *_METADATA_TYPES):
             self._unknown_types[prim.GetPath()] = prim.GetTypeName()
-        if "model:drawMode" in authored and prim.HasAPI(UsdGeom.ModelAPI):
-            mode = read.text(prim.GetAttribute("model:drawMode"), self._time, "inherited")
-            if mode not in ("inherited", "default"):
-                report.warn(prim.GetPath(), f"draw mode '{mode}' is not supported: the geometry itself is drawn")
-        drawn = DrawnPrim(prim, level, level_from_prim, authored)
+        children = prim.GetFilteredChildren(_PROTOTYPE_PREDICATE if pending.instancers else _DRAWN_PREDICATE)
+        drawn = DrawnPrim(prim, level, level_from_prim, authored, bool(children))
         if schema == "PointInstancer":
             if not self._in_render_pass(prim):
                 return []
@@ -193,10 +211,10 @@ class _Traversal:
             if self._pass is None:
                 report.warn(prim.GetPath(), "no render pass is selected: prims outside this one are drawn as well")
         elif schema in ("LightFilter", "PluginLightFilter"):
-            report.warn(prim.GetPath(), "light filters are not supported")
+            name = read.text(prim.GetAttribute("lightFilter:shaderId"), self._time) or schema
+            report.warn(prim.GetPath(), f"light filters are not supported: {name} changes nothing")
         elif prim.HasAPI(UsdLux.LightAPI) or schema == "PluginLight":
             report.warn(prim.GetPath(), f"{schema or prim.GetTypeName()} is not supported: it emits nothing")
-        children = prim.GetFilteredChildren(_PROTOTYPE_PREDICATE if pending.instancers else _DRAWN_PREDICATE)
         if children and "LODRootAPI" in prim.GetAppliedSchemas():
             # LODRootAPI: children are alternatives; a renderer without heuristics draws lod:default:index.
             default_index = read.raw(prim.GetAttribute("lod:default:index"), self._time)

@@ -1,16 +1,19 @@
 """The material of each triangle, from bindings, GeomSubsets and displayColor, in one table without duplicates."""
 
+import math
 from collections.abc import Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from warp_ir.scene import MAX_RADIANCE, Bools, Floats, Ints, Material
+from warp_ir.scene import MAX_RADIANCE, Bools, Color, Floats, Ints, Material, Wrap
+from warp_ir.usd.geometry.draw_mode import DrawMode
 from warp_ir.usd.images.cache import ImageCache
-from warp_ir.usd.images.shading_value import ShadingValue
+from warp_ir.usd.images.shading_value import PointRef, PrimvarRef, ShadingValue, SurfaceRef, UVMapping
+from warp_ir.usd.shading.bake import FACE_TEXELS, FieldOnPrim, PrimSurface, patch_size, texels
 from warp_ir.usd.shading.binding import PURPOSES, bound_materials, purposes_to_try
-from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material
+from warp_ir.usd.shading.surface_shader import EvaluatedMaterial, read_displacement, read_material, with_baked
 from warp_ir.usd.values import primvar, read
 from warp_ir.usd.values.report import Report, Unreadable
 from warp_ir.usd.values.triangles import TriangleMesh
@@ -19,8 +22,14 @@ TRANSPARENT = -1
 """Instead of a material index: opacity is 0, so the triangle is dropped."""
 UNBOUND = -2
 """Instead of a material index: no readable material is bound, so displayColor applies."""
+CARD_UV = "warp_ir:card"
+"""Name of the texture coordinates of models that are drawn as cards."""
+_CARD_CUTOFF = 0.1
+"""Opacity below which a card is absent, as in usdview."""
 _TETRAHEDRON = "tetrahedron"
 """Element type of GeomSubsets of a TetMesh's tetrahedra."""
+_MAX_FACE_TEXELS = 2**26
+"""Texels of all images with a patch for each triangle; a prim may have an eighth of those that are left."""
 _MAX_VARIANTS = 2**16
 """Maximum number of materials that the primvars of one prim create; beyond it, the mean is used."""
 
@@ -87,13 +96,16 @@ class MaterialTable:
         self._time, self._report = time, report
         self._images, self._black_metals = images or ImageCache(report), metals == "black"
         self._images.report = report
-        self._primvar_materials: dict[int, EvaluatedMaterial] = {}
+        self._fields: dict[int, EvaluatedMaterial] = {}
+        self._baked_images: dict[Hashable, ShadingValue] = {}
+        self._baked_prims: dict[Hashable, tuple[dict[int, EvaluatedMaterial], Floats | None]] = {}
+        self._face_texels_left = _MAX_FACE_TEXELS
         self._indices: dict[Material, int] = {}
         self._index_by_path: dict[Sdf.Path, int] = {}
         self._bound_index: dict[Sdf.Path, int] = {}
         self._with_subsets: set[Sdf.Path] = set()
         self._color_spaces: dict[Sdf.Path, str] = {}
-        self._plain_colors: dict[tuple[bytes, str], bool] = {}
+        self._plain_colors: dict[tuple[bytes, str], Color | None] = {}
         self._inherited: dict[tuple[Sdf.Path, str], Usd.Attribute | None] = {}
         self._dangling: dict[Sdf.Path, Sdf.Path | None] = {}
 
@@ -104,12 +116,26 @@ class MaterialTable:
             self.materials.append(material)
         return self._indices[material]
 
-    def resolve(self, prims: Sequence[Usd.Prim]) -> None:
-        """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work."""
+    def _add_with_fields(self, evaluated: EvaluatedMaterial) -> int:
+        """Index of a material that each prim evaluates for itself; no other material shares it."""
+        self.materials.append(evaluated.material)
+        self._fields[len(self.materials) - 1] = evaluated
+        return len(self.materials) - 1
+
+    def resolve(
+        self, prims: Sequence[Usd.Prim], childless: Container[Sdf.Path] = (), unbound: Container[Sdf.Path] = ()
+    ) -> None:
+        """Resolve the materials bound to prims and to their GeomSubsets in one call, since USD shares the work.
+
+        Args:
+            prims: The prims.
+            childless: Paths of those without children.
+            unbound: Paths of those without an opinion on `material:binding`.
+        """
         gprims = []
         for prim in prims:
             gprims.append(prim)
-            if subsets := material_subsets(prim):
+            if prim.GetPath() not in childless and (subsets := material_subsets(prim)):
                 gprims += subsets
                 self._with_subsets.add(prim.GetPath())
         for prim, bound in zip(gprims, bound_materials(gprims, purposes_to_try(self._purposes)), strict=True):
@@ -118,7 +144,7 @@ class MaterialTable:
                 if purpose and purpose not in self._purposes:
                     self._report.warn(prim.GetPath(), f"only a material of purpose '{purpose}' is bound; it is used")
                 self._bound_index[prim.GetPath()] = self._index_of(material)
-            elif (target := self._dangling_target(prim)) is not None:
+            elif (target := self._dangling_target(prim.GetParent() if prim.GetPath() in unbound else prim)) is not None:
                 self._report.warn(prim.GetPath(), f"the bound material {target} does not exist")
 
     def key(self, prim: Usd.Prim, authored: Container[str]) -> Hashable:
@@ -131,7 +157,7 @@ class MaterialTable:
             return None
         index = self._bound_index.get(path, UNBOUND)
         if index != UNBOUND:
-            plain = index >= 0 and index not in self._primvar_materials and not self.materials[index].textures
+            plain = index >= 0 and index not in self._fields and not self.materials[index].textures
             return index if plain else None
         if self._authored(prim, "primvars:displayOpacity", authored) is not None:
             return None
@@ -143,12 +169,31 @@ class MaterialTable:
             return None
         key = bytes(memoryview(values)), self._color_space(color)
         if key not in self._plain_colors:
-            primvar = UsdGeom.Primvar(color)
-            self._plain_colors[key] = bool(
-                primvar.GetInterpolation() == UsdGeom.Tokens.constant and all(0.0 <= x <= 1.0 for x in values[0])
-            )
+            self._plain_colors[key] = self._constant_color(color, values)
         indexed = "primvars:displayColor:indices" in authored or color.GetPrim() != prim
-        return None if indexed or not self._plain_colors[key] else key
+        return None if indexed or self._plain_colors[key] is None else key
+
+    @staticmethod
+    def _constant_color(attribute: Usd.Attribute, values: Vt.Vec3fArray) -> Color | None:
+        """One displayColor in linear Rec. 709; None: it is not constant, in [0, 1], and of a known colour space."""
+        if UsdGeom.Primvar(attribute).GetInterpolation() != UsdGeom.Tokens.constant:
+            return None
+        try:
+            rgb: Floats = np.asarray(values).astype(np.float64)
+            if read.is_color(attribute):
+                rgb = read.to_linear_rec709(attribute, rgb)
+        except Unreadable:
+            return None
+        red, green, blue = rgb[0].tolist()
+        return (red, green, blue) if all(0.0 <= x <= 1.0 for x in (red, green, blue)) else None
+
+    def assign_color(self, key: Hashable, shape: TriangleMesh) -> MaterialAssignment | None:
+        """What `assign` gives prims whose `key` is that of one displayColor; None: it is no such key."""
+        color = self._plain_colors.get(key) if isinstance(key, tuple) else None
+        if color is None:
+            return None
+        index = self.add(Material("displayColor", color))
+        return MaterialAssignment(np.full(len(shape.triangles), index, dtype=np.int32))
 
     def _authored(self, prim: Usd.Prim, name: str, authored: Container[str] | None = None) -> Usd.Attribute | None:
         """The attribute of a prim or, cached, of its nearest ancestor that has a value for it; None: there is none."""
@@ -195,17 +240,107 @@ class MaterialTable:
         self._dangling.update(dict.fromkeys(chain, target))
         return target
 
-    def assign(self, prim: Usd.Prim, shape: TriangleMesh) -> MaterialAssignment:
-        """The materials and colours of a prim's triangles; the prim must have been passed to `resolve`."""
+    def has_fields(self, prim: Usd.Prim) -> bool:
+        """Whether materials of a prim may have to be evaluated for it, as finely as the picture shows it."""
+        path = prim.GetPath()
+        return bool(self._fields) and (path in self._with_subsets or self._bound_index.get(path) in self._fields)
+
+    def assign(self, prim: Usd.Prim, shape: TriangleMesh, density: float = math.inf) -> MaterialAssignment:
+        """The materials and colours of a prim's triangles.
+
+        Args:
+            prim: The prim, which must have been passed to `resolve`.
+            shape: Its triangles.
+            density: Pixels of the picture per unit of its space.
+        """
         index = np.full(len(shape.triangles), self._bound_index.get(prim.GetPath(), UNBOUND), dtype=np.int32)
         for faces, bound in self._subsets(prim, shape):
             index[faces[shape.face]] = bound
-        return replace(self._with_primvar_values(prim, shape, index), uvs=self._uvs(prim, shape, index))
+        fields = {int(k): self._fields[k] for k in np.unique(index) if k in self._fields}
+        baked, face_texels = self._baked_for(prim, shape, fields, density) if fields else ({}, None)
+        assignment = self._with_primvar_values(prim, shape, index, baked)
+        uvs = self._uvs(prim, shape, index)
+        return replace(assignment, uvs=uvs if face_texels is None else {**uvs, FACE_TEXELS: face_texels})
 
-    def _with_primvar_values(self, prim: Usd.Prim, shape: TriangleMesh, index: Ints) -> MaterialAssignment:
-        """Applies displayColor to unbound triangles, and primvars to the materials that read them."""
+    def assign_draw_mode(self, prim: Usd.Prim, mode: DrawMode) -> MaterialAssignment:
+        """The colours, or the textures of cards with their opacity, of a model that is drawn as its draw mode."""
+        indices = []
+        for color, attribute in zip(mode.colors, mode.textures, strict=True):
+            material = Material(str(prim.GetPath()), color)
+            try:
+                material = material if attribute is None else self._card(material, attribute)
+            except Unreadable as trouble:
+                self._report.warn(prim.GetPath(), f"{trouble}; the card is of one colour")
+            indices.append(self.add(material))
+        return MaterialAssignment(np.array(indices, np.int32)[mode.shape.face], uvs={CARD_UV: mode.uvs})
+
+    def _card(self, material: Material, attribute: Usd.Attribute) -> Material:
+        """A card's material with the image that an attribute names, absent where it is transparent."""
+        mapping = UVMapping(CARD_UV, wrap=(Wrap.CLAMP, Wrap.CLAMP))
+        textures = []
+        for channels in ([0, 1, 2], [3]):
+            _, pixels, key, _ = self._images.look_up(
+                attribute,
+                self._time,
+                "auto",
+                np.zeros(4),
+                channels,
+                lambda what: self._report.warn(material.name, what),
+            )
+            value = ShadingValue(pixels, np.zeros(len(channels)), mapping, (key, tuple(channels)), attribute.GetName())
+            textures.append(self._images.texture(value))
+        image, alpha = textures
+        material = replace(material, albedo=image.mean, albedo_texture=image)
+        if alpha.pixels.min() >= 1.0:
+            return material
+        return replace(material, opacity=alpha.mean[0], cutoff=_CARD_CUTOFF, opacity_texture=alpha)
+
+    def _baked_for(
+        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial], density: float
+    ) -> tuple[dict[int, EvaluatedMaterial], Floats | None]:
+        """`_baked`, cached for the instances of a prim unless it reads what they may inherit."""
+        reads = {ref for evaluated in fields.values() for value in evaluated.fields.values() for ref in value.reads}
+        if any(isinstance(ref, PrimvarRef) or ref == PointRef("transform") for ref in reads):
+            return self._baked(prim, shape, fields, density)
+        path = (prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath()
+        key = (path, id(shape), tuple(fields))
+        if key not in self._baked_prims:
+            self._baked_prims[key] = self._baked(prim, shape, fields, density)
+        return self._baked_prims[key]
+
+    def _baked(
+        self, prim: Usd.Prim, shape: TriangleMesh, fields: Mapping[int, EvaluatedMaterial], density: float
+    ) -> tuple[dict[int, EvaluatedMaterial], Floats | None]:
+        """Materials whose fields that read more than primvars are textures of this prim, by index.
+
+        Returns:
+            The materials, and the texture coordinates `FACE_TEXELS` if any uses them, float32 [m, 3, 2].
+        """
+        surface = PrimSurface(prim, shape, self._time, self._report)
+        found = {
+            (k, what): FieldOnPrim(value, surface)
+            for k, evaluated in fields.items()
+            for what, value in _fields_to_bake(evaluated).items()
+        }
+        for k, what in [key for key, value in found.items() if key[1] == "normal" and not value.over_uv]:
+            self._report.warn(self.materials[k].name, "a normal map that depends on more than one uv set is left out")
+            del found[k, what]
+        on_faces = [value.field for value in found.values() if not value.over_uv]
+        size = patch_size(on_faces, surface, density, self._face_texels_left // 8) if on_faces else 0
+        self._face_texels_left -= texels(len(shape.triangles), size) * len(on_faces)
+        face_texels: Floats | None = None
+        baked = {k: replace(evaluated, normal=None) for k, evaluated in fields.items()}
+        for (k, what), value in found.items():
+            result = value.bake(size, self._baked_images)
+            face_texels = face_texels if result.uvs is None else result.uvs
+            baked[k] = with_baked(baked[k], what, result.value, self._images)
+        return baked, face_texels
+
+    def _with_primvar_values(
+        self, prim: Usd.Prim, shape: TriangleMesh, index: Ints, evaluated: Mapping[int, EvaluatedMaterial]
+    ) -> MaterialAssignment:
+        """Applies displayColor to unbound triangles, and their own values to materials that have fields."""
         bare = index == UNBOUND
-        evaluated = {int(k): self._primvar_materials[k] for k in np.unique(index) if k in self._primvar_materials}
         if not bare.any() and not evaluated:
             return MaterialAssignment(index)
         colors: Floats | None = None
@@ -220,7 +355,7 @@ class MaterialTable:
         )
         for k, surface in evaluated.items():
             chosen = index == k
-            material = self.materials[k]
+            material = surface.material
             color = self._from_primvars(prim, shape, surface.albedo, "albedo", 1.0)
             if color is None and surface.albedo is not None and material.albedo_texture is None:
                 lacking.append((chosen, surface.albedo))
@@ -230,6 +365,8 @@ class MaterialTable:
                     red, green, blue = color.tolist()
                     material = replace(material, albedo=(red, green, blue))
             index[chosen] = self._primvar_variants(prim, shape, surface, material)[chosen]
+            if k in self.displacements:
+                self.displacements.update(dict.fromkeys(np.unique(index[chosen]).tolist(), self.displacements[k]))
             if color is not None and color.ndim > 1:
                 colors = self.albedo(index)[:, None].repeat(3, axis=1) if colors is None else colors
                 colors[chosen] = color[chosen]
@@ -306,7 +443,7 @@ class MaterialTable:
         self, prim: Usd.Prim, shape: TriangleMesh, value: ShadingValue | None, what: str, upper: float
     ) -> Floats | None:
         """A shading value evaluated with the prim's primvars, [c] or [m, 3, c]; None if the prim has none of them."""
-        values = {}
+        values: dict[SurfaceRef, Floats] = {}
         for key in () if value is None else value.primvars:
             corners = primvar.corner_values(prim, shape, key.name, key.channels, self._time, self._report)
             if corners is not None:
@@ -315,7 +452,7 @@ class MaterialTable:
             return None
         result = value.evaluate(values)
         if result.min() < 0.0 or result.max() > upper:
-            names = ", ".join(key.name for key in values)
+            names = ", ".join(key.name for key in value.primvars if key in values)
             self._report.warn(prim.GetPath(), f"{what} of the primvar {names} outside [0, {upper:g}] clamped")
         return result.clip(0.0, upper)
 
@@ -350,6 +487,8 @@ class MaterialTable:
         names = dict.fromkeys(texture.uv for material in used for texture in material.textures)
         uvs = {}
         for name in names:
+            if name == FACE_TEXELS:
+                continue
             corners = primvar.texture_coordinates(prim, shape, name, self._time, self._report)
             if corners is not None:
                 uvs[name] = corners
@@ -409,12 +548,17 @@ class MaterialTable:
                     displacement = evaluated.displacement or read_displacement(material, self._time, self._images)
                     if displacement is not None:
                         self.displacements[self._index_by_path[path]] = displacement
-                if evaluated is not None and (evaluated.albedo or evaluated.emission or evaluated.opacity):
-                    self._primvar_materials[self._index_by_path[path]] = evaluated
+                if evaluated is not None and evaluated.fields:
+                    self._index_by_path[path] = self._add_with_fields(evaluated)
             except Unreadable as trouble:
                 self._report.warn(material.GetPath(), str(trouble))
                 self._index_by_path[path] = UNBOUND
         return self._index_by_path[path]
+
+
+def _fields_to_bake(evaluated: EvaluatedMaterial) -> dict[str, ShadingValue]:
+    """The fields of a material that read more than primvars, by what they are."""
+    return {what: value for what, value in evaluated.fields.items() if what == "normal" or not value.only_primvars}
 
 
 def material_subsets(prim: Usd.Prim) -> list[Usd.Prim]:

@@ -34,15 +34,23 @@ class EvaluatedMaterial:
 
     material: Material
     albedo: ShadingValue | None = None
-    """The albedo if it reads primvars, to be evaluated for each prim; else None."""
+    """The albedo if it is a field, to be evaluated for each prim; else None."""
     emission: ShadingValue | None = None
-    """The emission if it reads primvars; else None."""
+    """The emission if it is a field; else None."""
     opacity: ShadingValue | None = None
-    """The opacity if it reads primvars; else None."""
+    """The opacity if it is a field; else None."""
+    normal: ShadingValue | None = None
+    """The normal in tangent space if it is a field; else None."""
     threshold: float = 0.0
     """If positive, surfaces of lower opacity are cut out, and others are opaque."""
     displacement: ShadingValue | None = None
     """Displacement along the normal, one channel; None: there is none, or it is not asked for."""
+
+    @property
+    def fields(self) -> dict[str, ShadingValue]:
+        """The fields by the names of their attributes."""
+        named = {"albedo": self.albedo, "emission": self.emission, "opacity": self.opacity, "normal": self.normal}
+        return {name: value for name, value in named.items() if value is not None}
 
 
 def read_material(
@@ -191,7 +199,7 @@ class _NetworkInputs:
             if not UsdShade.Output.IsOutput(producer):
                 return None
             node = str(UsdShade.Shader(producer.GetPrim()).GetShaderId() or "an unnamed node")
-            if not node.startswith(("ND_normalmap", "ND_gltf_normalmap")):
+            if not node.startswith(("ND_normalmap", "ND_gltf_normalmap", "ND_normal_map_decode")):
                 self.warn(
                     f"{name}: the node {node} is not supported, only normalmap is; the surface's own normals are used"
                 )
@@ -205,6 +213,8 @@ class _NetworkInputs:
         if max(-value.lowest, value.highest) > 1.0:
             value = combine("normal", lambda n: np.clip(n, -1.0, 1.0), value)
         x, y, z = value.mean.tolist()
+        if value.reads:
+            return value
         if value.mapping is None:
             return None if x == y == 0.0 else replace(value, mapping=UVMapping())  # one texel
         if math.hypot(x, y) > 0.5 * abs(z):
@@ -226,13 +236,15 @@ class _NetworkInputs:
     def warn_unrendered_lobe(self, name: str, what: str) -> None:
         """Warns of a lobe that is not rendered, if its weight is not 0."""
         weight = self.scalar(name, 0.0)
-        if weight.highest > 0.0 or weight.primvars:
+        if weight.highest > 0.0 or weight.reads:
             self.warn(f"{what} is not rendered ({{n}} materials)")
 
     def number(self, name: str, default: float) -> float:
         """An input as a number; the mean if an image is connected."""
         value = self.scalar(name, default)
         self.warn_primvar_fallbacks(name, value)
+        if value.reads and not value.primvars and value.highest > value.lowest:
+            self.warn(f"{name} varies over the surface: a mean is used")
         return float(value.mean[0])
 
 
@@ -326,14 +338,14 @@ def _clamp01(pixels: Floats) -> Floats:
 
 
 def _weighted(color: ShadingValue, weight: ShadingValue) -> ShadingValue:
-    if weight.mapping is None and not weight.primvars and weight.mean[0] == 1.0:
+    if weight.mapping is None and not weight.reads and weight.mean[0] == 1.0:
         return color
     return combine("scaled", np.multiply, color, weight)
 
 
 def _metal_as_diffuse(inputs: _NetworkInputs, metallic: ShadingValue, albedo: ShadingValue) -> ShadingValue:
     """The albedo where the surface is a metal: its base colour, or 0 if metals are black."""
-    if metallic.highest <= 0.0 and not metallic.primvars:
+    if metallic.highest <= 0.0 and not metallic.reads:
         return albedo
     if not inputs.black_metals:
         inputs.warn("metal is rendered as a diffuse surface of its base colour ({n} materials)")
@@ -350,7 +362,7 @@ def _scattering(
     Metals do not scatter.
     """
     weight_value = inputs.scalar(weight, 0.0)
-    if weight_value.highest <= 0.0 and not weight_value.primvars:
+    if weight_value.highest <= 0.0 and not weight_value.reads:
         return albedo
     inputs.warn("subsurface scattering is rendered as diffuse reflection ({n} materials)")
 
@@ -365,10 +377,10 @@ def _scattering(
 def _tinted_by_coat(inputs: _NetworkInputs, weight: str, albedo: ShadingValue) -> ShadingValue:
     """The albedo below a coat, whose colour filters the reflection: coloured lacquer on metal, for example."""
     coat = inputs.scalar(weight, 0.0)
-    if coat.highest <= 0.0 and not coat.primvars:
+    if coat.highest <= 0.0 and not coat.reads:
         return albedo
     tint = inputs.color("coat_color", _WHITE)
-    if tint.lowest >= 1.0 and not tint.primvars:
+    if tint.lowest >= 1.0 and not tint.reads:
         return albedo
     return combine("coat", lambda a, c, t: a * (1.0 - np.clip(c, 0.0, 1.0) * (1.0 - _clamp01(t))), albedo, coat, tint)
 
@@ -382,7 +394,8 @@ def _evaluated(
     normal: ShadingValue | None,
 ) -> EvaluatedMaterial | None:
     """The evaluated material with an albedo in [0, 1] and a non-negative emission; None: opacity is 0."""
-    if albedo.lowest < 0.0 or albedo.highest > 1.0:
+    rounding = 1e-6 if albedo.reads else 0.0
+    if albedo.lowest < -rounding or albedo.highest > 1.0 + rounding:
         inputs.warn(f"albedo {_value_text(albedo)} clamped to [0, 1]")
         albedo = combine("clip", _clamp01, albedo)
     if emission.highest >= MAX_RADIANCE:
@@ -397,7 +410,7 @@ def _evaluated(
         values = np.append(values, opacity.outside)
     if threshold > 0.0:
         values = (values >= threshold).astype(np.float64)
-    if values.max() <= 0.0 and not opacity.primvars:
+    if values.max() <= 0.0 and not opacity.reads:
         return None
     opaque = values.min() >= 1.0
     if not opaque and threshold <= 0.0 and ((values > 0.0) & (values < 1.0)).any():
@@ -409,6 +422,8 @@ def _evaluated(
     else:
         inputs.warn_unrendered_input("displacement")
     network = inputs.network
+    normal_field = normal if normal is not None and normal.reads else None
+    normal = None if normal_field is not None else normal
     textured = opacity.mapping is not None and not opaque
     emissive_image = emission.mapping is not None and emission.highest > 0.0
     albedo_texture = None if albedo.mapping is None else network.texture(_with_bounded_border(albedo))
@@ -425,8 +440,54 @@ def _evaluated(
         opacity_texture,
         normal_texture=None if normal is None else network.texture(normal),
     )
-    albedo_value, emission_value, opacity_value = (x if x.primvars else None for x in (albedo, emission, opacity))
-    return EvaluatedMaterial(material, albedo_value, emission_value, opacity_value, threshold, displacement)
+    albedo_value, emission_value, opacity_value = (x if x.reads else None for x in (albedo, emission, opacity))
+    return EvaluatedMaterial(
+        material, albedo_value, emission_value, opacity_value, normal_field, threshold, displacement
+    )
+
+
+def with_baked(evaluated: EvaluatedMaterial, what: str, value: ShadingValue, images: ImageCache) -> EvaluatedMaterial:
+    """A material one of whose fields is an image or a constant on a prim.
+
+    Args:
+        evaluated: The material.
+        what: "albedo", "emission", "opacity" or "normal".
+        value: What replaces the field.
+        images: Cache of images.
+    """
+    upper = {"emission": MAX_RADIANCE}.get(what, 1.0)
+    lower = -1.0 if what == "normal" else 0.0
+    if value.lowest < lower or value.highest > upper:
+        value = combine(("clip", lower, upper), lambda a: np.clip(a, lower, upper), value)
+    texture = None if value.mapping is None else images.texture(value)
+    material = evaluated.material
+    if what == "albedo":
+        material = replace(material, albedo=_rgb(value.mean), albedo_texture=texture)
+    elif what == "emission":
+        emits = value.highest > 0.0
+        material = replace(material, emission=_rgb(value.mean), emission_texture=texture if emits else None)
+    elif what == "opacity":
+        threshold = evaluated.threshold
+        if texture is None:
+            opacity = float(value.mean[0])
+            opacity = float(opacity >= threshold) if threshold > 0.0 else opacity
+            material = replace(material, opacity=opacity, cutoff=0.0, opacity_texture=None)
+        else:
+            material = replace(
+                material, opacity=float(value.mean[0]), cutoff=min(threshold, 1.0), opacity_texture=texture
+            )
+    else:
+        material = replace(material, normal_texture=texture)
+    fields = {name: None if name == what else value for name, value in evaluated.fields.items()}
+    return EvaluatedMaterial(
+        material,
+        fields.get("albedo"),
+        fields.get("emission"),
+        fields.get("opacity"),
+        fields.get("normal"),
+        evaluated.threshold,
+        evaluated.displacement,
+    )
 
 
 def _with_bounded_border(value: ShadingValue) -> ShadingValue:

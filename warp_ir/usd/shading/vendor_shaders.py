@@ -251,7 +251,11 @@ def _omni_surface(inputs: ShaderInputs) -> SurfaceParameters:
     return SurfaceParameters(albedo, inputs.scalar("metalness", 0.0), emission, opacity, threshold)
 
 
-_CONSTANT_SHADERS = {"arnold:flat": "color", "PxrConstant": "emitColor"}
+_CONSTANT_SHADERS = {
+    "arnold:flat": "color",
+    "PxrConstant": "emitColor",
+    "ND_realitykit_unlit_surfaceshader": "color",
+}
 """Shaders of constant radiance without reflection, with the input for the colour."""
 
 

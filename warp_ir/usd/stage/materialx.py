@@ -159,14 +159,14 @@ def _document(content: bytes) -> "MaterialX.Document":
     options.readXIncludeFunction = None  # included files are not trusted
     try:
         mx.readFromXmlString(document, content.decode("utf-8", "replace"), mx.FileSearchPath(), options)
-        document.setDataLibrary(_standard_library())
+        document.setDataLibrary(standard_library())
     except Exception as error:  # the library's errors have no common base class
         raise Unreadable(f"no MaterialX: {_first_line(error)}") from None
     return document
 
 
 @lru_cache(maxsize=1)
-def _standard_library() -> "MaterialX.Document":
+def standard_library() -> "MaterialX.Document":
     """The library's standard definitions."""
     import MaterialX as mx
 
@@ -248,12 +248,32 @@ class _Writer:
                     out = graph.CreateOutput(element.getName(), _type(element))
                     self._connect(element, out, path)
                 continue
-            shader = UsdShade.Shader.Define(self._stage, path)
             definition = node.getNodeDef()
+            own = None if definition is None else self._own_graph(definition)
+            if own is not None:
+                self._custom_node(node, definition, own, path)
+                continue
+            shader = UsdShade.Shader.Define(self._stage, path)
             name = definition.getName() if definition is not None else f"ND_{node.getCategory()}_{node.getType()}"
             shader.SetShaderId(name)
             for element in node.getInputs():
                 self._input(element, shader.ConnectableAPI(), path.GetParentPath())
+
+    def _own_graph(self, definition: "MaterialX.NodeDef") -> "MaterialX.NodeGraph | None":
+        """The graph by which the document itself defines a node; None: the node is the library's, or is none."""
+        graphs = [g for g in self._document.getNodeGraphs() if g.getNodeDefString() == definition.getName()]
+        return graphs[0] if graphs and not standard_library().getNodeDef(definition.getName()) else None
+
+    def _custom_node(
+        self, node: "MaterialX.Node", definition: "MaterialX.NodeDef", graph: "MaterialX.NodeGraph", path: Sdf.Path
+    ) -> None:
+        """Writes a node that the document defines as a node graph of its own, with the definition's defaults."""
+        owner = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
+        for declared in definition.getActiveInputs():
+            element = node.getInput(declared.getName())
+            self._input(declared if element is None else element, owner, path.GetParentPath())
+        for element in graph.getOutputs():
+            self._connect(element, owner.CreateOutput(element.getName(), _type(element)), path)
 
     def _input(self, element: "MaterialX.PortElement", owner: UsdShade.ConnectableAPI, scope: Sdf.Path) -> None:
         """Writes an input with its connection or value; `scope` contains the nodes that it may name."""
