@@ -49,7 +49,11 @@ class GiSettings:
     filter: bool = True
     """Whether the noise is filtered; else a picture is the unbiased mean of its iterations."""
     accumulate: str = "off"
-    """"off": every call begins anew. "static": a view's mean goes on while nothing that it shows has moved."""
+    """"off": every call begins anew. "static": a view's mean goes on while nothing that it depends on has changed.
+    "temporal": what a surface received in earlier steps goes on while it moves, which is biased: changes of light are
+    seen late."""
+    max_history: int = 8
+    """Of "temporal": for how many steps at most the past counts."""
     seed: int = 0
     """Seed of the random numbers."""
     extent: float | None = None
@@ -381,6 +385,7 @@ class SensorCamera:
                 max_bounces=self.gi.max_bounces,
                 filter=self.gi.filter,
                 accumulate=self.gi.accumulate,
+                max_history=self.gi.max_history,
                 seed=self.gi.seed,
                 cull_back_faces=bool(config.enable_backface_culling),
                 max_distance=float(config.max_distance),

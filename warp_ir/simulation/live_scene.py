@@ -201,6 +201,11 @@ class LiveScene:
         return self.placements.transforms
 
     @property
+    def deforming_rows(self) -> "wp.array[wp.int32]":
+        """The rows in the table of points of all meshes that deform."""
+        return self._moving_points.rows if self.deforming else self._all_rows
+
+    @property
     def has_normals(self) -> bool:
         """Whether any surface has normals of its own."""
         return self._bodies.scene.has_normals

@@ -100,6 +100,19 @@ class Clear:
 
 
 @wp.struct
+class NearestSurfaces:
+    """The surface that a pixel's nearest sample hits; empty unless the next step looks for it (`history`)."""
+
+    instance: wp.array[wp.int32]
+    triangle: wp.array[wp.int32]
+    barycentric: wp.array[wp.vec2]  # weights of the triangle's first and second corner
+    position: wp.array[wp.vec3]  # device frame
+    normal: wp.array[wp.vec3]  # smooth
+    footprint: wp.array[wp.float32]  # width of the pixel
+    sample: wp.array[wp.int32]
+
+
+@wp.struct
 class ViewSums:
     """Sums over iterations, one row for each pixel of each view."""
 
@@ -112,6 +125,8 @@ class ViewSums:
     direct: wp.array[wp.vec3]  # irradiance over π; empty: nothing is filtered
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the mean channels of both
+    reused: wp.array[wp.vec2]  # iterations of earlier steps in direct and indirect; empty: nothing is reprojected
+    surfaces: NearestSurfaces
 
 
 @wp.struct
@@ -416,6 +431,18 @@ def _clear_nearest(pixel: int, clear: Clear, out: Outputs) -> None:
         out.shape_index[pixel] = clear.shape_index
 
 
+@wp.func
+def _keep_surface(views: ViewRays, pixel: int, seen: ViewHit, normal: wp.vec3, out: NearestSurfaces) -> None:
+    """Writes what `NearestSurfaces` has of a pixel."""
+    out.instance[pixel] = seen.hit.instance
+    out.triangle[pixel] = seen.hit.triangle
+    out.barycentric[pixel] = wp.vec2(seen.hit.u, seen.hit.v)
+    out.position[pixel] = seen.hit.position
+    out.normal[pixel] = normal
+    out.footprint[pixel] = seen.footprint
+    out.sample[pixel] = views.sample
+
+
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
 def _trace_views(
     first: int,
@@ -468,6 +495,8 @@ def _trace_views(
     if hit.t < sums.nearest[pixel]:
         sums.nearest[pixel] = hit.t
         _write_nearest(views, view, pixel, ids, seen, mapped, out)
+        if sums.surfaces.instance.shape[0] > 0:
+            _keep_surface(views, pixel, seen, normal, sums.surfaces)
 
 
 @wp.func
