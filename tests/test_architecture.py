@@ -33,7 +33,7 @@ LAYERS = [
     ["guiding", "reconstruction", "scheduling"],
     ["estimators", "interrupt"],
     ["renderer", "simulation"],
-    ["newton"],
+    ["newton", "mujoco"],
     ["preview"],
     ["view"],
     ["cli"],

@@ -11,8 +11,9 @@ newton = pytest.importorskip("newton", reason="extra 'newton'")
 from newton.sensors import SensorCamera as NewtonCamera  # noqa: E402
 
 from tests.live import look_at  # noqa: E402
-from warp_ir.newton import GiSettings, SensorCamera, shapes  # noqa: E402
+from warp_ir.newton import GiSettings, SensorCamera  # noqa: E402
 from warp_ir.scene import InputError  # noqa: E402
+from warp_ir.simulation import shapes  # noqa: E402
 
 pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore::newton.NewtonWarning")]
 
