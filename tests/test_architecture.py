@@ -46,7 +46,7 @@ USD_LAYERS = [
     ["shading"],
     ["settings"],
     ["camera_prim", "diagnose", "linking", "time_varying", "vpl_layers"],
-    ["edit_layer", "traverse"],
+    ["edit_layer", "live_edits", "traverse"],
     ["assemble"],
     ["load"],
     ["__init__"],
