@@ -416,3 +416,30 @@ def test_images_are_shared_without_a_copy(pair):
     ours = wp.from_dlpack(theirs)
     shots(pair[1], [EYE], rays(4), [0], into={"depth": ours})
     assert theirs.max() > 1.0 and (ours.numpy() == theirs).all()
+
+
+def test_tensors_of_torch_are_poses_and_images(pair):
+    """Poses come from a tensor and images go into one, or one is made of an image: all without a copy."""
+    torch = pytest.importorskip("torch")
+    poses = torch.tensor(np.array([EYE]), dtype=torch.float32)
+    tensor = torch.zeros((1, 4, 4, 3))
+    image = wp.from_torch(tensor, dtype=wp.vec3)
+    depth = wp.zeros((1, 4, 4), dtype=wp.float32, device="cpu")
+    of_depth = torch.from_dlpack(depth)
+    bundle, worlds = array(rays(4), wp.vec3), array([0], wp.int32)
+    for distance in (4.0, 6.0):
+        poses[0, 2] = distance
+        pair[1].render(wp.from_torch(poses, dtype=wp.transformf), bundle, worlds, hdr_color=image, depth=depth, step=0)
+        expected = shots(pair[1], poses.numpy(), rays(4), [0], ("hdr_color", "depth"), step=0)
+        assert (tensor.numpy() == expected["hdr_color"]).all() and tensor.max() > 0.0
+        assert (of_depth.numpy() == expected["depth"]).all()
+
+
+def test_arrays_of_jax_are_poses_and_images_become_arrays(pair):
+    """Poses come from an array of JAX, and an image is one, both by DLPack without a copy."""
+    jax = pytest.importorskip("jax")
+    poses = wp.from_jax(jax.numpy.asarray(np.array([EYE]), dtype=np.float32), dtype=wp.transformf)
+    depth = wp.zeros((1, 4, 4), dtype=wp.float32, device="cpu")
+    pair[1].render(poses, array(rays(4), wp.vec3), array([0], wp.int32), depth=depth, step=0)
+    expected = shots(pair[1], [EYE], rays(4), [0], ("depth",), step=0)
+    assert (np.asarray(wp.to_jax(depth)) == expected["depth"]).all()
