@@ -21,10 +21,10 @@ import mujoco_warp
 import numpy as np
 import warp as wp
 
-from warp_ir.device_scene import DeviceFrame
 from warp_ir.mujoco.model_scene import model_scene
 from warp_ir.scene import InputError
 from warp_ir.simulation import LiveScene, Views, ViewSettings
+from warp_ir.simulation.live_scene import fixed_frame
 from warp_ir.simulation.placement import Placements, color_instance, move_instance
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -203,7 +203,7 @@ class RenderContext:
             world_count=worlds,
             ids=read.geoms,
             unbounded=read.unbounded,
-            frame=DeviceFrame(np.zeros(3), 1.0),
+            frame=fixed_frame(read.scene, read.unbounded),
             device=str(theirs.rgb_data.device),
         )
         """The scene, on the device."""

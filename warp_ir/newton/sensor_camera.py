@@ -21,11 +21,11 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera as NewtonSensorCamera
 
-from warp_ir.device_scene import DeviceFrame
 from warp_ir.newton.model_scene import ModelScene, check_model, model_scene
 from warp_ir.scene import Floats, InputError, Light, LightKind
 from warp_ir.simulation import ClearValues, LiveScene, Views, ViewSettings
 from warp_ir.simulation.images import from_srgb
+from warp_ir.simulation.live_scene import fixed_frame
 from warp_ir.simulation.placement import Placements, color_instance, move_instance
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -450,7 +450,7 @@ class _SensorScene:
             deforming=(*read.simulated, *read.skinned),
             unbounded=read.unbounded,
             extent=gi.extent,
-            frame=DeviceFrame(np.zeros(3), 1.0),
+            frame=fixed_frame(read.scene, read.unbounded),
             device=str(model.device),
         )
         self.views = Views(self.live)

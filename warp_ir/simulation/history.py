@@ -173,7 +173,10 @@ def _end_views(first: int, iterations: int, count: wp.array[wp.int32], step: wp.
 
 @wp.func
 def last_position(scene: SceneData, views: ViewRays, motion: Motion, sums: ViewSums, pixel: int) -> wp.vec3:
-    """Where the point that a pixel shows was in the last step, in scene units; not finite if that is not known."""
+    """Where the point that a pixel shows was in the last step, in scene units from the frame's origin.
+
+    It is not finite if that is not known.
+    """
     i = sums.surfaces.instance[pixel]
     p = sums.surfaces.position[pixel]
     if motion.moving.shape[0] > 0:
@@ -187,12 +190,12 @@ def last_position(scene: SceneData, views: ViewRays, motion: Motion, sums: ViewS
             if moving >= 0:
                 moved += weights[k] * (motion.last_points[moving] - scene.points[row])
         p += scene.instance_axes[i] * moved
-    p = p / views.scale + views.origin
+    p = p / views.scale
     now = motion.transforms[i]
     last = motion.last_transforms[i]
     if not same_pose(now, last):
-        local = wp.transpose(rotation_of(now)) * (p - wp.transform_get_translation(now))
-        p = rotation_of(last) * local + wp.transform_get_translation(last)
+        local = wp.transpose(rotation_of(now)) * (p - (wp.transform_get_translation(now) - views.origin))
+        p = rotation_of(last) * local + (wp.transform_get_translation(last) - views.origin)
     return p
 
 
@@ -313,12 +316,14 @@ def _find_past(
     place = pixel - begin
     position = last_position(worlds[world], views, motion, sums, pixel)
     normal = last_normal(motion, sums, pixel)
-    point = wp.transform_point(wp.transform_inverse(history.last_transforms[view]), position)
+    camera = history.last_transforms[view]
+    from_camera = position - (wp.transform_get_translation(camera) - views.origin)
+    point = wp.quat_rotate_inv(wp.transform_get_rotation(camera), from_camera)
     start = wp.vec2i(place % views.columns, place // views.columns)
     at = pixel_that_sees(views, sums.surfaces.sample[pixel], start, point)
     if at[2] == 0.0:
         return
-    position = (position - views.origin) * views.scale
+    position *= views.scale
     farthest = _PLANE_DISTANCE * sums.surfaces.footprint[pixel]
     rows = wp.vec4i(-1)
     weights = wp.vec4(0.0)

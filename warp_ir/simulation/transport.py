@@ -365,9 +365,9 @@ def view_hit(scene: SceneData, views: ViewRays, view: int, row: int, column: int
     out = ViewHit()
     out.hit.triangle = -1
     pose = views.transforms[view]
-    origin = wp.transform_point(pose, views.rays[row, column, sample, 0])
+    place = wp.transform_get_translation(pose) - views.origin  # first, so that far away little is rounded
+    out.origin = (place + wp.transform_vector(pose, views.rays[row, column, sample, 0])) * views.scale
     out.direction = wp.transform_vector(pose, views.rays[row, column, sample, 1])
-    out.origin = (origin - views.origin) * views.scale
     squared = wp.dot(out.direction, out.direction)
     # A direction of length 0 is no ray; comparisons with NaN are false.
     if not (squared > 1.0e-12 and wp.isfinite(squared) and wp.isfinite(wp.dot(out.origin, out.origin))):
@@ -409,7 +409,7 @@ def _write_nearest(
     if out.forward_depth.shape[0] > 0:
         pose = views.transforms[view]
         forward = wp.transform_vector(pose, wp.vec3(0.0, 0.0, -1.0))
-        to_origin = seen.origin / views.scale + views.origin - wp.transform_get_translation(pose)
+        to_origin = seen.origin / views.scale - (wp.transform_get_translation(pose) - views.origin)
         along = wp.dot(seen.direction, forward) * seen.hit.t / views.scale
         out.forward_depth[pixel] = wp.dot(to_origin, forward) + along
     if out.normal.shape[0] > 0:
