@@ -375,8 +375,9 @@ def compile_for(arch: int) -> int:
     from warp_ir.device.launcher import _BLOCK_DIM
 
     files = [path for path in (ROOT / "warp_ir").rglob("*.py") if "@wp.kernel" in path.read_text()]
-    if importlib.util.find_spec("newton") is None:
-        files = [path for path in files if path.parent.name != "newton"]
+    for folder, module in (("newton", "newton"), ("mujoco", "mujoco_warp")):
+        if importlib.util.find_spec(module) is None:
+            files = [path for path in files if path.parent.name != folder]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sorted(files)]
     for name in [*names, "rays"]:
         importlib.import_module(name)

@@ -38,11 +38,13 @@ _MOST_LOCAL_OF_RAYS = 2320
 # Light paths of many worlds have copies of their world's settings and buffers in addition.
 _MOST_LOCAL_OF_WORLDS = 3328
 PACKAGE = Path(ir.__file__).parent
+EXTRAS = {"newton": "newton", "mujoco": "mujoco_warp"}
+"""What the kernels of a folder need."""
 KERNEL_FILES = [
     importlib.import_module(".".join(("warp_ir", *path.relative_to(PACKAGE).with_suffix("").parts)))
     for path in sorted(PACKAGE.rglob("*.py"))
     if "@wp.kernel" in path.read_text()
-    and (path.parent.name != "newton" or importlib.util.find_spec("newton") is not None)
+    and (path.parent.name not in EXTRAS or importlib.util.find_spec(EXTRAS[path.parent.name]) is not None)
 ]
 
 

@@ -11,8 +11,9 @@ newton = pytest.importorskip("newton", reason="extra 'newton'")
 from newton.sensors import SensorCamera as NewtonCamera  # noqa: E402
 
 from tests.live import look_at  # noqa: E402
-from warp_ir.newton import GiSettings, SensorCamera, shapes  # noqa: E402
+from warp_ir.newton import GiSettings, SensorCamera  # noqa: E402
 from warp_ir.scene import InputError  # noqa: E402
+from warp_ir.simulation import shapes  # noqa: E402
 
 pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore::newton.NewtonWarning")]
 
@@ -218,6 +219,30 @@ def test_a_moved_model_is_a_new_one():
     model.shape_color.assign(colors)
     assert (grey != expected["hdr_color_image"]).any()
     assert (view(used, later, pose, 32, step=0)["hdr_color_image"] == expected["hdr_color_image"]).all()
+
+
+def test_a_model_far_away_has_the_same_bits():
+    """A model 2^20 m from the origin looks like one at it: poses there are multiples of 1/8 m, and as exact as at 0.
+
+    The ball at which photons are aimed is rounded on the host, so light may differ by float32's rounding.
+    """
+    pictures = []
+    for far in (0.0, 2.0**20):
+        builder = newton.ModelBuilder()
+        for k in range(3):
+            body = builder.add_body(xform=wp.transform(wp.vec3(far + k, 0.5 * k, 0.5), wp.quat_identity()))
+            builder.add_shape_box(body, hx=0.4, hy=0.3, hz=0.5, color=(0.8, 0.3, 0.2))
+        model = builder.finalize(device="cpu")
+        pose = z_up((1.0, -4.0, 2.0), (1.0, 0.5, 0.5))
+        pose[0] = far + 1.0
+        names = ("hdr_color_image", "depth_image", "forward_depth_image", "normal_image", "shape_index_image")
+        settings = GiSettings(light_paths=64, filter=False)
+        pictures.append(view(SensorCamera(model, gi=settings), model.state(), pose, 32, names=names, step=0))
+    assert (pictures[0]["shape_index_image"] == 0).any()
+    light = [picture.pop("hdr_color_image") for picture in pictures]
+    for name, values in pictures[0].items():
+        assert (values == pictures[1][name]).all(), name
+    assert np.isclose(light[0], light[1], rtol=1.0e-4, atol=1.0e-5).mean() > 0.99
 
 
 def test_worlds_do_not_see_each_other():

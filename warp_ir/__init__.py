@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from warp_ir.settings import RenderSettings as RenderSettings
     from warp_ir.simulation import ClearValues as ClearValues
     from warp_ir.simulation import LiveScene as LiveScene
+    from warp_ir.simulation import LiveStage as LiveStage
     from warp_ir.simulation import Views as Views
     from warp_ir.simulation import ViewSettings as ViewSettings
     from warp_ir.usd import StageReader as StageReader
@@ -62,6 +63,7 @@ _HOME = {
     "render": "renderer",
     "ClearValues": "simulation",
     "LiveScene": "simulation",
+    "LiveStage": "simulation",
     "ViewSettings": "simulation",
     "Views": "simulation",
     "trace_vpls": "vpl.trace",

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_ir.image.tonemap import srgb_to_linear
-from warp_ir.newton import shapes
 from warp_ir.scene import Floats, InputError, Instances, Ints, Material, Mesh, Scene, Texture
+from warp_ir.simulation import shapes
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 

@@ -21,11 +21,11 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera as NewtonSensorCamera
 
-from warp_ir.device_scene import DeviceFrame
 from warp_ir.newton.model_scene import ModelScene, check_model, model_scene
 from warp_ir.scene import Floats, InputError, Light, LightKind
 from warp_ir.simulation import ClearValues, LiveScene, Views, ViewSettings
 from warp_ir.simulation.images import from_srgb
+from warp_ir.simulation.live_scene import fixed_frame
 from warp_ir.simulation.placement import Placements, color_instance, move_instance
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -49,7 +49,11 @@ class GiSettings:
     filter: bool = True
     """Whether the noise is filtered; else a picture is the unbiased mean of its iterations."""
     accumulate: str = "off"
-    """"off": every call begins anew. "static": a view's mean goes on while nothing that it shows has moved."""
+    """"off": every call begins anew. "static": a view's mean goes on while nothing that it depends on has changed.
+    "temporal": what a surface received in earlier steps goes on while it moves, which is biased: changes of light are
+    seen late."""
+    max_history: int = 8
+    """Of "temporal": for how many steps at most the past counts."""
     seed: int = 0
     """Seed of the random numbers."""
     extent: float | None = None
@@ -381,6 +385,7 @@ class SensorCamera:
                 max_bounces=self.gi.max_bounces,
                 filter=self.gi.filter,
                 accumulate=self.gi.accumulate,
+                max_history=self.gi.max_history,
                 seed=self.gi.seed,
                 cull_back_faces=bool(config.enable_backface_culling),
                 max_distance=float(config.max_distance),
@@ -445,7 +450,7 @@ class _SensorScene:
             deforming=(*read.simulated, *read.skinned),
             unbounded=read.unbounded,
             extent=gi.extent,
-            frame=DeviceFrame(np.zeros(3), 1.0),
+            frame=fixed_frame(read.scene, read.unbounded),
             device=str(model.device),
         )
         self.views = Views(self.live)

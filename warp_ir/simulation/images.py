@@ -2,24 +2,19 @@
 
 import warp as wp
 
-from warp_ir.reconstruction.filter import IrradianceLayer, normalized, rgb, similarity, tap_weight, weighted
+from warp_ir.reconstruction.filter import (
+    IrradianceLayer,
+    mean_channels,
+    normalized,
+    rgb,
+    similarity,
+    tap_weight,
+    weighted,
+)
 from warp_ir.reconstruction.pixel_surfaces import PLANE_DISTANCE, PixelSurfaces
-from warp_ir.simulation.placement import same_pose
 from warp_ir.simulation.transport import DISABLE_CLEAR, DISABLE_PRESERVE, Clear, Outputs, ViewRays, ViewSums
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
-
-
-@wp.struct
-class ViewHistory:
-    """What views showed in the last step, for pictures that go on while nothing moves."""
-
-    accumulates: int
-    transforms: wp.array[wp.transformf]  # [views]
-    world: wp.array[wp.int32]
-    version: wp.array[wp.int32]  # of the world and of what all worlds share, in sum
-    rays: wp.array4d[wp.vec3]  # empty unless it accumulates
-    rays_changed: wp.array[wp.int32]  # [rows]
 
 
 @wp.kernel
@@ -36,61 +31,6 @@ def _select_worlds(
     views.world[view] = world
     if world >= 0:
         used[world] = 1
-
-
-@wp.kernel
-def _compare_rays(first: int, views: ViewRays, history: ViewHistory) -> None:
-    """Whether a row of rays differs from that of the last step, whose place it takes."""
-    row = first + wp.tid()
-    changed = int(0)
-    for column in range(views.columns):
-        for sample in range(views.samples):
-            for k in range(2):
-                ray = views.rays[row, column, sample, k]
-                if not (history.rays[row, column, sample, k] == ray):
-                    history.rays[row, column, sample, k] = ray
-                    changed = 1
-    history.rays_changed[row] = changed
-
-
-@wp.kernel
-def _begin_views(
-    first: int,
-    ends: wp.array[wp.int32],
-    versions: wp.array[wp.int32],
-    views: ViewRays,
-    history: ViewHistory,
-    count: wp.array[wp.int32],
-) -> None:
-    """Gives a view the slot of its world, and begins its sums anew unless nothing has changed since the last step."""
-    view = first + wp.tid()
-    world = views.world[view]
-    version = int(-1)
-    if world >= 0:
-        views.slot[view] = ends[world] - 1
-        version = versions[world] + versions[versions.shape[0] - 1]
-    else:
-        views.slot[view] = -1
-    same = history.accumulates == 1 and history.version[view] == version and history.world[view] == world
-    if history.accumulates == 1:
-        for row in range(views.rows):
-            if history.rays_changed[row] == 1:
-                same = False
-    pose = views.transforms[view]
-    if not (same and same_pose(history.transforms[view], pose)):
-        count[view] = 0
-    history.transforms[view] = pose
-    history.version[view] = version
-    history.world[view] = world
-
-
-@wp.kernel
-def _end_views(first: int, iterations: int, count: wp.array[wp.int32], step: wp.array[wp.int32]) -> None:
-    """Counts the iterations of a view; the first one counts the step."""
-    view = first + wp.tid()
-    count[view] += iterations
-    if view == 0:
-        step[0] += 1
 
 
 @wp.struct
@@ -129,32 +69,39 @@ def _match(surfaces: PixelSurfaces, own: Surface, q: int) -> wp.vec2:
 
 
 @wp.func
-def _mean_channels(sums: ViewSums, pixel: int) -> wp.vec2:
-    direct = sums.direct[pixel]
-    indirect = sums.indirect[pixel]
-    return wp.vec2((direct[0] + direct[1] + direct[2]) / 3.0, (indirect[0] + indirect[1] + indirect[2]) / 3.0)
+def pixel_iterations(views: ViewRays, sums: ViewSums, view: int, pixel: int, iterations: int) -> wp.vec2:
+    """Of how many iterations the irradiance of a pixel, direct and indirect, is the sum: those that hit a surface."""
+    n = wp.vec2(float(sums.count[view] + iterations) * sums.albedo[pixel][3] / float(views.samples))
+    if sums.reused.shape[0] > 0:
+        n += sums.reused[pixel]
+    return n
 
 
 @wp.func
-def _variance_of_mean(sums: ViewSums, pixel: int, n: float) -> wp.vec2:
+def _variance_of_mean(sums: ViewSums, pixel: int, n: wp.vec2) -> wp.vec2:
     """Variances of the means of n iterations of a pixel, from their spread."""
-    mean = _mean_channels(sums, pixel) / n
-    return wp.max(sums.squares[pixel] / n - wp.cw_mul(mean, mean), wp.vec2(0.0)) / (n - 1.0)
+    mean = wp.cw_div(mean_channels(sums.direct[pixel], sums.indirect[pixel]), n)
+    spread = wp.max(wp.cw_div(sums.squares[pixel], n) - wp.cw_mul(mean, mean), wp.vec2(0.0))
+    return wp.cw_div(spread, n - wp.vec2(1.0))
 
 
 @wp.func
-def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int, n: float) -> wp.vec2:
-    """Variances of the mean channels of n iterations, direct and indirect, of pixels around that show the same surface.
+def _local_variances(views: ViewRays, surfaces: PixelSurfaces, sums: ViewSums, p: int, iterations: int) -> wp.vec2:
+    """Variances of the mean channels, direct and indirect, of pixels around that show the same surface.
 
     The spread of the iterations tells it; of a single iteration the spread of the neighbours, in which differences that
     are real count as noise.
     """
     row = p // surfaces.columns
     column = p - row * surfaces.columns
-    begin = (row // rows) * rows
+    view = row // views.rows
+    begin = view * views.rows
     surface = _surface_of(surfaces, p)
-    own = _mean_channels(sums, p)  # the others are relative to it, so that little cancels
-    spread = n > 1.5
+    n = pixel_iterations(views, sums, view, p, iterations)
+    own = wp.cw_div(
+        mean_channels(sums.direct[p], sums.indirect[p]), n
+    )  # the others are relative to it, so that little cancels
+    spread = wp.min(n) > 1.5
     weight = wp.vec2(1.0)
     mean = wp.vec2(0.0)
     square = wp.vec2(0.0)
@@ -162,18 +109,20 @@ def _local_variances(surfaces: PixelSurfaces, sums: ViewSums, rows: int, p: int,
         square = _variance_of_mean(sums, p, n)
     for dy in range(-2, 3):
         y = row + dy
-        if y >= begin and y < begin + rows:
+        if y >= begin and y < begin + views.rows:
             for dx in range(-2, 3):
                 x = column + dx
                 # Every other one of 5 x 5.
                 if x >= 0 and x < surfaces.columns and (dx + dy) % 2 == 0 and not (dx == 0 and dy == 0):
                     q = y * surfaces.columns + x
                     w = _match(surfaces, surface, q)
-                    weight += w
-                    if spread:
+                    n = pixel_iterations(views, sums, view, q, iterations)
+                    if spread and wp.min(n) > 1.5:
+                        weight += w
                         square += wp.cw_mul(w, _variance_of_mean(sums, q, n))
-                    else:
-                        difference = _mean_channels(sums, q) - own
+                    elif not spread and wp.min(n) > 0.0:
+                        weight += w
+                        difference = wp.cw_div(mean_channels(sums.direct[q], sums.indirect[q]), n) - own
                         mean += wp.cw_mul(w, difference)
                         square += wp.cw_mul(w, wp.cw_mul(difference, difference))
     mean = wp.cw_div(mean, weight)
@@ -189,13 +138,12 @@ def _begin_filter(
     view = pixel // (views.rows * views.columns)
     layer.direct[pixel] = wp.vec4(0.0, 0.0, 0.0, -1.0)
     layer.indirect[pixel] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-    hits = sums.albedo[pixel][3]
-    if views.world[view] < 0 or hits <= 0.0 or surfaces.footprint[pixel] <= 0.0:
+    if views.world[view] < 0 or sums.albedo[pixel][3] <= 0.0 or surfaces.footprint[pixel] <= 0.0:
         return
-    n = float(sums.count[view] + iterations) * hits / float(views.samples)
-    direct = sums.direct[pixel] / n
-    indirect = sums.indirect[pixel] / n
-    variance = _local_variances(surfaces, sums, views.rows, pixel, n)
+    n = pixel_iterations(views, sums, view, pixel, iterations)
+    direct = sums.direct[pixel] / n[0]
+    indirect = sums.indirect[pixel] / n[1]
+    variance = _local_variances(views, surfaces, sums, pixel, iterations)
     layer.direct[pixel] = wp.vec4(direct[0], direct[1], direct[2], variance[0])
     layer.indirect[pixel] = wp.vec4(indirect[0], indirect[1], indirect[2], variance[1])
 
@@ -326,6 +274,8 @@ def _write_images(
     if world >= 0:
         albedo = sums.albedo[pixel]
         n = float(sums.count[view] + iterations)
+        if sums.reused.shape[0] > 0:
+            n += wp.min(sums.reused[pixel])
         covered = albedo[3] / float(views.samples)
         rho = wp.vec3(albedo[0], albedo[1], albedo[2]) / float(views.samples)
         color = sums.radiance[pixel] / n

@@ -201,6 +201,11 @@ class LiveScene:
         return self.placements.transforms
 
     @property
+    def deforming_rows(self) -> "wp.array[wp.int32]":
+        """The rows in the table of points of all meshes that deform."""
+        return self._moving_points.rows if self.deforming else self._all_rows
+
+    @property
     def has_normals(self) -> bool:
         """Whether any surface has normals of its own."""
         return self._bodies.scene.has_normals
@@ -545,6 +550,29 @@ class LiveScene:
             rows["tree"]["bvh"] = self._box_tree.id
             rows["tree"]["root"], rows["tree"]["shared_root"] = found[:-1], found[-1]
         return launcher.array(rows, TwoLevel)
+
+
+_FRAME_GRID = 1024.0
+"""Distance of the origins that `fixed_frame` chooses from."""
+
+
+def fixed_frame(scene: Scene, unbounded: Collection[int] = ()) -> DeviceFrame:
+    """A frame in scene units near the instances of a scene, which stays the same wherever they move nearby.
+
+    Args:
+        scene: The scene, all of whose meshes are instanced.
+        unbounded: Rows of instances that do not count.
+    """
+    places = [np.zeros((0, 3))]
+    for group in scene.instances:
+        points = scene.meshes[group.meshes[0]].points
+        centre = 0.5 * (points.min(axis=0) + points.max(axis=0)) if len(points) else np.zeros(3)
+        places.append(group.matrices[:, :3, :3] @ centre + group.matrices[:, :3, 3])
+    every = np.concatenate(places)
+    kept: Bools = np.asarray(np.isfinite(every).all(axis=1))
+    kept[list(unbounded)] = False
+    middle = np.median(every[kept], axis=0) if kept.any() else np.zeros(3)
+    return DeviceFrame(np.round(middle / _FRAME_GRID) * _FRAME_GRID, 1.0)
 
 
 def _frame_of(balls: Floats) -> DeviceFrame:

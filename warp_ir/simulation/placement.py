@@ -192,7 +192,7 @@ def _bake_points(
     p = wp.vec3(0.0)
     if is_finite(pose):
         local = rotation_of(pose) * (placements.stretch[i] * rest[k])
-        p = (local + wp.transform_get_translation(pose) - worlds.origin) * worlds.scale
+        p = (local + (wp.transform_get_translation(pose) - worlds.origin)) * worlds.scale
         if wp.length(p - worlds.focus[placements.group[i]]) > worlds.reach[placements.group[i]]:
             p = wp.vec3(0.0)
     points[point_rows[k]] = p
@@ -230,8 +230,8 @@ def _place_instances(
             own_scale = prototypes.scale[k]
             axes = stretch * (worlds.scale / own_scale)
             inverse = placements.inverse_stretch[i] * wp.transpose(rotation) * (own_scale / worlds.scale)
-            translation = wp.transform_get_translation(pose) + stretch * prototypes.origin[k]
-            centre = (translation - worlds.origin) * worlds.scale
+            place = wp.transform_get_translation(pose) - worlds.origin  # first, so that far away little is rounded
+            centre = (place + stretch * prototypes.origin[k]) * worlds.scale
         half = 0.5 * (prototypes.upper[k] - prototypes.lower[k])
         middle = 0.5 * (prototypes.upper[k] + prototypes.lower[k])
         reach = wp.vec3(0.0)

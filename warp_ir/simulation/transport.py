@@ -100,6 +100,19 @@ class Clear:
 
 
 @wp.struct
+class NearestSurfaces:
+    """The surface that a pixel's nearest sample hits; empty unless the next step looks for it (`history`)."""
+
+    instance: wp.array[wp.int32]
+    triangle: wp.array[wp.int32]
+    barycentric: wp.array[wp.vec2]  # weights of the triangle's first and second corner
+    position: wp.array[wp.vec3]  # device frame
+    normal: wp.array[wp.vec3]  # smooth
+    footprint: wp.array[wp.float32]  # width of the pixel
+    sample: wp.array[wp.int32]
+
+
+@wp.struct
 class ViewSums:
     """Sums over iterations, one row for each pixel of each view."""
 
@@ -112,6 +125,8 @@ class ViewSums:
     direct: wp.array[wp.vec3]  # irradiance over π; empty: nothing is filtered
     indirect: wp.array[wp.vec3]
     squares: wp.array[wp.vec2]  # of the mean channels of both
+    reused: wp.array[wp.vec2]  # iterations of earlier steps in direct and indirect; empty: nothing is reprojected
+    surfaces: NearestSurfaces
 
 
 @wp.struct
@@ -350,9 +365,9 @@ def view_hit(scene: SceneData, views: ViewRays, view: int, row: int, column: int
     out = ViewHit()
     out.hit.triangle = -1
     pose = views.transforms[view]
-    origin = wp.transform_point(pose, views.rays[row, column, sample, 0])
+    place = wp.transform_get_translation(pose) - views.origin  # first, so that far away little is rounded
+    out.origin = (place + wp.transform_vector(pose, views.rays[row, column, sample, 0])) * views.scale
     out.direction = wp.transform_vector(pose, views.rays[row, column, sample, 1])
-    out.origin = (origin - views.origin) * views.scale
     squared = wp.dot(out.direction, out.direction)
     # A direction of length 0 is no ray; comparisons with NaN are false.
     if not (squared > 1.0e-12 and wp.isfinite(squared) and wp.isfinite(wp.dot(out.origin, out.origin))):
@@ -394,7 +409,7 @@ def _write_nearest(
     if out.forward_depth.shape[0] > 0:
         pose = views.transforms[view]
         forward = wp.transform_vector(pose, wp.vec3(0.0, 0.0, -1.0))
-        to_origin = seen.origin / views.scale + views.origin - wp.transform_get_translation(pose)
+        to_origin = seen.origin / views.scale - (wp.transform_get_translation(pose) - views.origin)
         along = wp.dot(seen.direction, forward) * seen.hit.t / views.scale
         out.forward_depth[pixel] = wp.dot(to_origin, forward) + along
     if out.normal.shape[0] > 0:
@@ -414,6 +429,18 @@ def _clear_nearest(pixel: int, clear: Clear, out: Outputs) -> None:
         out.normal[pixel] = clear.normal
     if out.shape_index.shape[0] > 0:
         out.shape_index[pixel] = clear.shape_index
+
+
+@wp.func
+def _keep_surface(views: ViewRays, pixel: int, seen: ViewHit, normal: wp.vec3, out: NearestSurfaces) -> None:
+    """Writes what `NearestSurfaces` has of a pixel."""
+    out.instance[pixel] = seen.hit.instance
+    out.triangle[pixel] = seen.hit.triangle
+    out.barycentric[pixel] = wp.vec2(seen.hit.u, seen.hit.v)
+    out.position[pixel] = seen.hit.position
+    out.normal[pixel] = normal
+    out.footprint[pixel] = seen.footprint
+    out.sample[pixel] = views.sample
 
 
 @wp.kernel(cuda_max_registers=MAX_REGISTERS)
@@ -468,6 +495,8 @@ def _trace_views(
     if hit.t < sums.nearest[pixel]:
         sums.nearest[pixel] = hit.t
         _write_nearest(views, view, pixel, ids, seen, mapped, out)
+        if sums.surfaces.instance.shape[0] > 0:
+            _keep_surface(views, pixel, seen, normal, sums.surfaces)
 
 
 @wp.func

@@ -6,6 +6,7 @@
         light paths of every world             -> VplBuffer           transport.py, vpl/emission.py
         the VPLs of every world, in sets       -> VplSets             transport.py, vpl/sets.py
         every pixel gathers those of its world -> ViewSums            transport.py, estimators/vpl.py
+    what its surface received in earlier steps -> ViewSums            history.py
         filter, mix, pack                          -> the caller's arrays images.py
 
 Each line is one launch, or a few, for all views and worlds. From the second call with arrays of one shape on, nothing
@@ -13,6 +14,7 @@ is allocated and nothing is read back: the launches can be recorded as a CUDA gr
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,8 +31,8 @@ from warp_ir.reconstruction.filter import LEVELS, SIGMA_DECAY, SIGMAS, Irradianc
 from warp_ir.reconstruction.pixel_surfaces import PixelSurfaces
 from warp_ir.scene import InputError
 from warp_ir.settings import UNLIMITED
-from warp_ir.simulation import images, transport
-from warp_ir.simulation.images import ViewHistory
+from warp_ir.simulation import history, images, transport
+from warp_ir.simulation.history import OFF, STATIC, TEMPORAL, UNLIT, LastPictures, Motion, PastLight, ViewHistory
 from warp_ir.simulation.live_scene import LiveScene
 from warp_ir.simulation.transport import Clear, Outputs, ViewRays, ViewSums, WorldPaths
 from warp_ir.vpl.emission import CAPACITY_PER_PATH, LightPathSettings, VplBuffer
@@ -47,7 +49,7 @@ from warp_ir.vpl.sets import (
     vec16,
 )
 
-ACCUMULATE_NAMES = ("off", "static")
+ACCUMULATE_NAMES = ("off", "static", "temporal")
 DEFAULT_BYTES = 2**28
 """Default of `Views.bytes`."""
 _MOST_CALLS = 16
@@ -64,6 +66,19 @@ _OUTPUTS = {
 }
 
 
+_SURFACES: dict[str, Any] = {
+    "instance": wp.int32,
+    "triangle": wp.int32,
+    "barycentric": wp.vec2,
+    "position": wp.vec3,
+    "normal": wp.vec3,
+    "footprint": wp.float32,
+    "sample": wp.int32,
+}
+_PAST: dict[str, Any] = {"count": wp.vec2, "direct": wp.vec3, "indirect": wp.vec3, "squares": wp.vec2, "local": wp.vec4}
+_LAST: dict[str, Any] = _PAST | {"instance": wp.int32, "position": wp.vec3, "normal": wp.vec3}
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewSettings:
     """How views are rendered. Every value is checked on construction; an `InputError` names the field."""
@@ -77,7 +92,11 @@ class ViewSettings:
     filter: bool = True
     """Whether the noise is filtered; else a picture is the unbiased mean of its iterations."""
     accumulate: str = "off"
-    """"off": every call begins anew. "static": a view's mean goes on while nothing that it depends on has changed."""
+    """"off": every call begins anew. "static": a view's mean goes on while nothing that it depends on has changed.
+    "temporal": what a surface received in earlier steps goes on as well while it moves. That is biased, because light
+    that changes is seen late; where nothing changes it is "static"."""
+    max_history: int = 8
+    """Of "temporal": for how many steps at most the past counts beside the present one, if anything moves."""
     seed: int = 0
     """Seed of the random numbers: the same seed and step give the same bits."""
     cull_back_faces: bool = False
@@ -90,8 +109,10 @@ class ViewSettings:
     def __post_init__(self) -> None:
         """Checks every field."""
         bounces = 0 if self.max_bounces is None else self.max_bounces
+        numbers: tuple[tuple[str, int, int], ...]
         numbers = (("iterations", self.iterations, 1), ("light_paths", self.light_paths, 1))
-        for name, value, least in (*numbers, ("max_bounces", bounces, 0), ("seed", self.seed, 0)):
+        numbers += (("max_history", self.max_history, 1), ("max_bounces", bounces, 0), ("seed", self.seed, 0))
+        for name, value, least in numbers:
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise InputError(f"{name}: must be a whole number of at least {least}, is {value!r}")
         if self.accumulate not in ACCUMULATE_NAMES:
@@ -133,9 +154,10 @@ class Views:
         """[1], on the device: the number of the step, on which random numbers depend; every call adds 1."""
         self._calls: dict[tuple[Any, ...], LaunchList] = {}
         self._allocations = 0
+        self._moving: Any = None
         self._world_buffers: dict[tuple[Any, ...], _WorldBuffers] = {}
         with self.launcher.loading():
-            self.launcher.load([transport, images])
+            self.launcher.load([transport, history, images])
 
     def render(
         self,
@@ -225,8 +247,9 @@ class Views:
         out = LaunchList(self.launcher)
         shape = (transforms.shape[0], rays.shape[0], rays.shape[1])
         views, clear_record = self._begin(transforms, rays, settings), _clear(clear, settings)
-        self._select(worlds, views, settings, shape, out)
-        sums = self._sums(shape, lit and settings.filter, outputs.error.shape[0] > 0)
+        temporal = lit and settings.accumulate == "temporal"
+        history_record = self._select(worlds, views, settings, lit, shape, out)
+        sums = self._sums(shape, lit and (settings.filter or temporal), outputs.error.shape[0] > 0, temporal)
         samples = rays.shape[2]
         iterations = -(-settings.iterations // samples) * samples if lit else samples
         pixels = shape[0] * shape[1] * shape[2]
@@ -239,11 +262,14 @@ class Views:
             if lit:
                 self._light(views, iteration, settings, shape, sums, out)
         layer = new_layer(*[self._scratch.array("none4", 1, wp.vec4)[:0]] * 2)
+        out.phase = "history"
+        if temporal:
+            self._reproject(views, sums, history_record, iterations, settings.max_history, shape, out)
         out.phase = "filter"
-        if lit and settings.filter:
-            layer = self._filter(views, sums, iterations, shape, out)
+        if lit and (settings.filter or temporal):
+            layer = self._filter(views, sums, iterations, LEVELS if settings.filter else 0, shape, out)
         out.launch(images._write_images, pixels, [views, iterations, sums, layer, clear_record, outputs])
-        out.launch(images._end_views, shape[0], [iterations if lit else 0, sums.count, self.step])
+        out.launch(history._end_views, shape[0], [iterations if lit else 0, sums.count, self.step])
         return out
 
     def _check(self, transforms: Any, rays: Any, worlds: Any) -> None:
@@ -285,6 +311,7 @@ class Views:
                 has_emission=scene.glows,
             )
             scratch.array("count", shape[0], wp.int32).zero_()
+            scratch.array("history.has_pictures", shape[0], wp.int32).zero_()
             self._used = self.launcher.zeros(scene.world_count, wp.int32)
             self._calls.clear()
         views = ViewRays()
@@ -297,8 +324,14 @@ class Views:
         return views
 
     def _select(
-        self, worlds: Any, views: ViewRays, settings: ViewSettings, shape: tuple[int, ...], out: LaunchList
-    ) -> None:
+        self,
+        worlds: Any,
+        views: ViewRays,
+        settings: ViewSettings,
+        lit: bool,
+        shape: tuple[int, ...],
+        out: LaunchList,
+    ) -> ViewHistory:
         """Gives the worlds that are shown their slots, and notes which views have not changed."""
         scratch, scene = self._scratch, self.scene
         count, rays_shape = scene.world_count, (*shape[1:], views.samples, 2)
@@ -312,20 +345,23 @@ class Views:
         out.launch(images._select_worlds, shape[0], [wanted, count, views, self._used])
         out.scan(self._used, ends)
         out.launch(transport._list_worlds, count, [self._used, ends, paths])
-        history = ViewHistory()
-        history.accumulates = int(settings.accumulate != "off")
-        history.transforms = scratch.array("history.transforms", shape[0], wp.transformf)
-        history.world = scratch.array("history.world", shape[0], wp.int32)
-        history.version = scratch.array("history.version", shape[0], wp.int32)
-        history.rays_changed = scratch.array("history.rays_changed", shape[1], wp.int32)
-        if history.accumulates:
+        record = ViewHistory()
+        kinds = {"off": OFF, "static": STATIC, "temporal": TEMPORAL}
+        record.accumulates = int(kinds[settings.accumulate] if lit else UNLIT)
+        record.transforms = scratch.array("history.transforms", shape[0], wp.transformf)
+        record.last_transforms = scratch.array("history.last_transforms", shape[0], wp.transformf)
+        for name in ("world", "version", "has_pictures", "relation"):
+            setattr(record, name, scratch.array(f"history.{name}", shape[0], wp.int32))
+        record.rays_changed = scratch.array("history.rays_changed", shape[1], wp.int32)
+        if lit and settings.accumulate != "off":
             total = int(np.prod(rays_shape))
-            history.rays = scratch.array("history.rays", total, wp.vec3)[:total].reshape(rays_shape)
-            out.launch(images._compare_rays, shape[1], [views, history])
-        inputs = [ends, scene.versions, views, history, scratch.array("count", shape[0], wp.int32)]
-        out.launch(images._begin_views, shape[0], inputs)
+            record.rays = scratch.array("history.rays", total, wp.vec3)[:total].reshape(rays_shape)
+            out.launch(history._compare_rays, shape[1], [views, record])
+        inputs = [ends, scene.versions, views, record, scratch.array("count", shape[0], wp.int32)]
+        out.launch(history._begin_views, shape[0], inputs)
+        return record
 
-    def _sums(self, shape: tuple[int, ...], filtered: bool, error: bool) -> ViewSums:
+    def _sums(self, shape: tuple[int, ...], filtered: bool, error: bool, temporal: bool) -> ViewSums:
         scratch, pixels = self._scratch, shape[0] * shape[1] * shape[2]
         sums = ViewSums()
         sums.count = scratch.array("count", shape[0], wp.int32)
@@ -342,9 +378,51 @@ class Views:
         sums.direct = optional("sums.direct", filtered, wp.vec3)
         sums.indirect = optional("sums.indirect", filtered, wp.vec3)
         sums.squares = optional("sums.squares", filtered, wp.vec2)
+        sums.reused = optional("sums.reused", temporal, wp.vec2)
+        for name, kind in _SURFACES.items():
+            setattr(sums.surfaces, name, optional(f"surfaces.{name}", temporal, kind))
+        self._last, self._past = LastPictures(), PastLight()
+        for record, prefix, names in ((self._last, "last", _LAST), (self._past, "past", _PAST)):
+            for name, dtype in names.items():
+                setattr(record, name, optional(f"{prefix}.{name}", temporal, dtype))
+            record.radiance = optional(f"{prefix}.radiance", temporal and error, wp.vec3)
+            record.square = optional(f"{prefix}.square", temporal and error, wp.float32)
         if scratch.allocations != allocations:
             sums.count.zero_()  # sums that are new have to begin with the first iteration
+            scratch.array("history.has_pictures", shape[0], wp.int32).zero_()
         return sums
+
+    def _reproject(
+        self,
+        views: ViewRays,
+        sums: ViewSums,
+        record: ViewHistory,
+        iterations: int,
+        most: int,
+        shape: tuple[int, ...],
+        out: LaunchList,
+    ) -> None:
+        """Adds what surfaces received in earlier steps, and keeps what pixels show for the next one."""
+        scene, scratch, pixels = self.scene, self._scratch, shape[0] * shape[1] * shape[2]
+        motion = Motion()
+        motion.transforms = scene.transforms
+        motion.last_transforms = scratch.array("motion.transforms", scene.count, wp.transformf)[: scene.count]
+        rows = scene.deforming_rows
+        motion.moving = scratch.array("none.moving", 1, wp.int32)[:0]
+        if rows.shape[0]:
+            if self._moving is None:
+                table = np.full(scene.data.points.shape[0], -1)
+                table[rows.numpy()] = np.arange(rows.shape[0])
+                self._moving = self.launcher.array(table, wp.int32)
+            motion.moving = self._moving
+        motion.last_points = scratch.array("motion.points", max(rows.shape[0], 1), wp.vec3)
+        inputs = [scene.worlds, views, record, motion, self._last, sums, self._past]
+        out.launch(history._find_past, pixels, inputs)
+        limit = float(most * iterations)
+        out.launch(history._weigh_past, pixels, [views, record, iterations, limit, sums, self._past])
+        out.launch(history._continue_views, pixels, [views, iterations, sums, self._past, self._last])
+        out.call(partial(wp.copy, motion.last_transforms, motion.transforms))
+        out.launch(history._keep_points, rows.shape[0], [rows, scene.data.points, motion.last_points])
 
     def _light(
         self,
@@ -393,8 +471,9 @@ class Views:
             out.launch(transport._gather_views, shape[0] * shape[1] * shape[2], inputs)
 
     def _filter(
-        self, views: ViewRays, sums: ViewSums, iterations: int, shape: tuple[int, ...], out: LaunchList
+        self, views: ViewRays, sums: ViewSums, iterations: int, levels: int, shape: tuple[int, ...], out: LaunchList
     ) -> IrradianceLayer:
+        """Means of irradiance, filtered on so many levels."""
         scratch, gbuffer = self._scratch, self._gbuffer
         pixels = shape[0] * shape[1] * shape[2]
         surfaces = PixelSurfaces()
@@ -406,7 +485,7 @@ class Views:
             for k in range(2)
         ]
         out.launch(images._begin_filter, pixels, [views, surfaces, iterations, sums, layers[0]])
-        for level in range(LEVELS):
+        for level in range(levels):
             sigmas = wp.vec2(*(sigma * SIGMA_DECAY**level for sigma in SIGMAS))
             out.launch(images._filter_views, pixels, [shape[1], surfaces, *layers, 1 << level, sigmas])
             layers.reverse()

@@ -1,4 +1,4 @@
-"""Triangles of Newton's shapes, in the space of a shape; curved ones with the normals of the true surface."""
+"""Triangles of the shapes of simulators, in the space of a shape; curved ones with the normals of the true surface."""
 
 import math
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ def capsule(radius: float, half_height: float) -> Triangles:
 def cylinder(barrel: float = 0.0) -> Triangles:
     """A cylinder of radius 1 and half height 1; `barrel` is the excess of the square of its radius in the middle.
 
-    Newton's barrels are cut-off ellipsoids: r² = 1 + barrel (1 - z²).
+    Barrels are those of Newton, cut-off ellipsoids: r² = 1 + barrel (1 - z²).
     """
     z = np.linspace(-1.0, 1.0, SEGMENTS // 4 + 1 if barrel > 0.0 else 2)
     r = np.sqrt(1.0 + barrel * (1.0 - z * z))
