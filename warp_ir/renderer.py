@@ -252,6 +252,8 @@ class Renderer:
         If it refuses, the settings stay as they were.
         """
         wanted = settings or self.wanted
+        if wanted.estimator != "path" and any(material.gloss is not None for material in scene.materials):
+            raise InputError(f"estimator: {wanted.estimator} reflects diffusely, and the scene has gloss; path renders it")
         resolved = wanted.resolve(scene.camera.aspect, self._guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
