@@ -125,7 +125,9 @@ def test_an_area_light_is_reflected_as_the_quadrature_says(roughness, device):
     matrix[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # -Z down
     matrix[:3, 3] = [-1.2, 1.0, 0.1]
     lamp = ir.Light(name="lamp", kind=LightKind.RECT, radiance=WHITE, width=0.5, height=0.5, world_from_light=matrix)
-    film = render(plane(Gloss((0.0, 0.0, 0.0), specular_color=(0.5,) * 3, roughness=roughness), view, lamp), "path", device)
+    film = render(
+        plane(Gloss((0.0, 0.0, 0.0), specular_color=(0.5,) * 3, roughness=roughness), view, lamp), "path", device
+    )
     n = 800
     a, b = np.meshgrid(*[(np.arange(n) + 0.5) / n - 0.5] * 2, indexing="ij")
     p = np.stack([-1.2 + 0.5 * a, np.ones_like(a), 0.1 + 0.5 * b], axis=-1)

@@ -30,6 +30,7 @@ def open_reader(args: argparse.Namespace) -> "StageReader":
         complexity=args.complexity,
         default_light=args.default_light,
         metals=args.metals,
+        materials=args.materials,
         texture_wrap=args.texture_wrap,
         strict=args.strict,
         render_settings=args.render_settings,

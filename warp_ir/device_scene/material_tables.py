@@ -63,12 +63,14 @@ def _gloss_tables(materials: tuple[Material, ...], row: dict[Texture | None, int
             out.enabled = 1
             out.f0 = ((1.0 - gloss.ior) / (1.0 + gloss.ior)) ** 2
             out.has_specular_color = int(gloss.specular_color is not None)
-            for name in ("metallic", "roughness", "clearcoat", "clearcoat_roughness"):
+            for name in ("metallic", "specular_weight", "roughness", "clearcoat", "clearcoat_roughness"):
                 setattr(out, name, getattr(gloss, name))
-            out.base_color, out.specular_color = wp.vec3(*gloss.base_color), wp.vec3(*(gloss.specular_color or (0,) * 3))
-            for name in GlossRow.vars:
-                if name.endswith("_texture"):
-                    setattr(out, name, row[getattr(gloss, name)])
+            out.base_color, out.specular_color = (
+                wp.vec3(*gloss.base_color),
+                wp.vec3(*(gloss.specular_color or (0,) * 3)),
+            )
+            for name in ("base_color", "metallic", "specular_color", "roughness", "clearcoat", "clearcoat_roughness"):
+                setattr(out, f"{name}_texture", row[getattr(gloss, f"{name}_texture")])
         rows.append(out)
     tables = GlossTables()
     tables.rows = launcher.array(rows, GlossRow)

@@ -30,6 +30,7 @@ class GlossRow:
     specular_color: wp.vec3
     specular_color_texture: int
     f0: float  # of the dielectric and of the clearcoat
+    specular_weight: float  # factor of what the dielectric reflects
     roughness: float
     roughness_texture: int
     clearcoat: float

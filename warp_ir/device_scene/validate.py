@@ -109,7 +109,14 @@ def _check_material(material: Material) -> None:
     gloss = material.gloss
     if gloss is not None:
         colors = (*gloss.base_color, *(gloss.specular_color or ()))
-        shares = (gloss.metallic, gloss.roughness, gloss.clearcoat, gloss.clearcoat_roughness, *colors)
+        shares = (
+            gloss.metallic,
+            gloss.specular_weight,
+            gloss.roughness,
+            gloss.clearcoat,
+            gloss.clearcoat_roughness,
+            *colors,
+        )
         demand(all(0.0 <= x <= 1.0 for x in shares), "colours, metallic, roughness and clearcoat must lie in [0, 1]")
         demand(0.0 < gloss.ior < math.inf, f"ior must be positive, is {gloss.ior:g}")
     for bounded in (material.albedo_texture, material.opacity_texture, *(gloss.textures if gloss else ())):

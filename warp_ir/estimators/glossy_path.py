@@ -1,16 +1,23 @@
-"""Path tracing where surfaces reflect by direction (`bsdf/reflection.py`); `path.py` launches it for such scenes.
+"""Path tracing where surfaces reflect by direction (`bsdf/reflection.py`).
 
 As there, every vertex samples one light, and the sampled direction may hit an emitter as well. A mirror samples no
 light: what its direction hits counts in full. Shading normals count where the camera sees a surface, directly or by
 reflections in gloss and mirrors, geometric normals at all vertices after a diffuse reflection.
 """
 
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar
+
 import warp as wp
 
+import warp_ir.gbuffer
 from warp_ir.bsdf import AlbedoTable, Bsdf, BsdfSample, bsdf_pdf, directional_albedo, evaluate, sample_bsdf
-from warp_ir.device.launcher import MAX_REGISTERS, Launcher
-from warp_ir.device_scene import CameraData, DeviceScene, SceneData
-from warp_ir.gbuffer import GBuffer, camera_ray, first_hit, image_pixel, jitter, lens_point
+from warp_ir.device.launcher import MAX_REGISTERS
+from warp_ir.device_scene import CameraData, SceneData
+from warp_ir.estimators.path import PathTracer
+from warp_ir.gbuffer import GBuffer, camera_ray, first_hit, image_pixel, jitter, lens_point, trace_primary
 from warp_ir.lights import (
     intersect_lights,
     light_visibility,
@@ -144,7 +151,7 @@ def _footprint(camera: CameraData, depth: float) -> float:
 
 @wp.func
 def _over(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """a / b for each channel; 0 where b is 0."""
+    """A / b for each channel; 0 where b is 0."""
     tiny = 1.0e-30
     return wp.vec3(a[0] / wp.max(b[0], tiny), a[1] / wp.max(b[1], tiny), a[2] / wp.max(b[2], tiny))
 
@@ -232,17 +239,28 @@ def _trace_glossy_paths(
     gbuffer.indirect[pixel] = _over(indirect, albedo)
 
 
-def trace_glossy_paths(
-    scene: DeviceScene,
-    camera: CameraData,
-    launcher: Launcher,
-    gbuffer: GBuffer,
-    iteration: "wp.array[wp.int32]",
-    seed: int,
-    scramble: "wp.array[wp.uint32]",
-    max_bounces: int,
-) -> None:
-    """Computes the irradiance of a G-buffer, relative to the albedo of the view, for one iteration."""
-    with launcher.phase("gather"):
-        arguments = [scene.data, camera, gbuffer, iteration, wp.uint32(seed), scramble, max_bounces]
-        launcher.launch(_trace_glossy_paths, indices(gbuffer.tiles), arguments)
+class GlossyPathTracer(PathTracer):
+    """Path tracing of scenes with gloss."""
+
+    MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, sys.modules[__name__])
+
+    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
+        """Fills the G-buffer; irradiance is relative to the albedo of the view, by which it replaces the albedo."""
+        settings, launcher = self._settings, self._launcher
+        self.prepare(iteration)
+        with launcher.phase("primary"):
+            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
+        with launcher.phase("gather"):
+            launcher.launch(
+                _trace_glossy_paths,
+                indices(gbuffer.tiles),
+                [
+                    self._scene.data,
+                    self._camera,
+                    gbuffer,
+                    self._iteration,
+                    wp.uint32(settings.seed),
+                    self._scramble,
+                    settings.max_bounces,
+                ],
+            )

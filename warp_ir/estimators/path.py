@@ -264,9 +264,6 @@ class PathTracer:
         self.prepare(iteration)
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
-        if self._scene.data.gloss_count > 0:
-            self._trace_glossy_paths(gbuffer)
-            return
         with launcher.phase("gather"):
             launcher.launch(
                 _trace_paths,
@@ -280,12 +277,3 @@ class PathTracer:
                     int(self._has_spots),
                 ],
             )
-
-    def _trace_glossy_paths(self, gbuffer: GBuffer) -> None:
-        """The paths of a scene with gloss."""
-        from warp_ir.estimators import glossy_path  # its kernel is compiled for such scenes alone
-
-        settings, launcher = self._settings, self._launcher
-        glossy_path.trace_glossy_paths(
-            self._scene, self._camera, launcher, gbuffer, self._iteration, settings.seed, self._scramble, settings.max_bounces
-        )

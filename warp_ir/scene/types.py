@@ -130,6 +130,8 @@ class Gloss:
     """In [0, 1]; its square is the α of the distribution GGX of normals. Below 0.032 the surface is a mirror."""
     ior: float = 1.5
     """Index of refraction of the dielectric, and of the clearcoat."""
+    specular_weight: float = 1.0
+    """Factor, in [0, 1], of what the dielectric reflects at its surface."""
     clearcoat: float = 0.0
     """Weight of the clearcoat, in [0, 1]."""
     clearcoat_roughness: float = 0.01

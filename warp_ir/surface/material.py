@@ -157,8 +157,10 @@ def bsdf_at(address: wp.uint64, hit: Hit, footprint: float) -> Bsdf:
         out.f90 = wp.vec3(1.0)
     else:
         metallic = _gloss_texture(scene, hit, row.metallic_texture, wp.vec3(row.metallic), footprint)[0]
-        out.f90 = wp.vec3(1.0 - metallic) + base * metallic
-        out.f0 = out.f90 * (row.f0 + (1.0 - row.f0) * metallic)
+        dielectric = (1.0 - metallic) * row.specular_weight
+        tint = wp.vec3(1.0 - metallic) + base * metallic
+        out.f90 = tint * (metallic + dielectric)
+        out.f0 = tint * (metallic + row.f0 * dielectric)
         out.diffuse = base * (1.0 - metallic)
     out.coat = _gloss_texture(scene, hit, row.clearcoat_texture, wp.vec3(row.clearcoat), footprint)[0]
     if out.coat > 0.0:

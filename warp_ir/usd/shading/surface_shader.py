@@ -7,11 +7,12 @@ that share of the rays pass undeflected; emission is reduced by it as well.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.scene import MAX_RADIANCE, Color, Floats, Material, Wrap
+from warp_ir.scene import MAX_RADIANCE, Color, Floats, Gloss, Material, Wrap
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, as_color, combine, constant
 from warp_ir.usd.shading.network import ShadingNetwork
@@ -24,6 +25,7 @@ _BLACK: Color = (0.0, 0.0, 0.0)
 _WHITE: Color = (1.0, 1.0, 1.0)
 _MIN_OPACITY = 0.02
 """Opacity down to which a transparent surface emits in full: few rays hit it, and each is weighted by its inverse."""
+_GLOSS_VALUES = ("base_color", "metallic", "roughness", "clearcoat", "clearcoat_roughness", "specular_color")
 _DISPLACEMENT = "ND_displacement_float"
 """MaterialX's shader of displacements along the normal."""
 
@@ -50,7 +52,7 @@ def read_material(
     time: Usd.TimeCode,
     images: ImageCache,
     *,
-    black_metals: bool = False,
+    reflection: str = "diffuse",
     displaces: bool = False,
 ) -> EvaluatedMaterial | None:
     """Evaluates a bound material; None: its opacity is 0 everywhere.
@@ -59,7 +61,7 @@ def read_material(
         material: The material.
         time: Time code of all values.
         images: Cache of images.
-        black_metals: Whether metals keep only their diffuse lobe.
+        reflection: "diffuse"; "black": metals keep only their diffuse lobe; "all": gloss as well.
         displaces: Whether the displacement is wanted; else a warning says that it is not rendered.
 
     Raises:
@@ -82,7 +84,7 @@ def read_material(
     if any(not (displaces and source.GetShaderId() == _DISPLACEMENT) for source in unsupported):
         images.report.warn(path, "displacement is not rendered ({n} materials)")
     inputs = [
-        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), black_metals, displaces)
+        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), reflection, displaces)
         for shader in shaders
     ]
     for shader, shader_inputs in zip(shaders, inputs, strict=True):
@@ -120,7 +122,9 @@ def read_displacement(material: UsdShade.Material, time: Usd.TimeCode, images: I
     for context in ("mtlx", ""):
         source = material.ComputeDisplacementSource(context)[0]
         if source and source.GetShaderId() == _DISPLACEMENT:
-            inputs = _NetworkInputs(source.ConnectableAPI(), ShadingNetwork(images, material.GetPath(), time), False)
+            inputs = _NetworkInputs(
+                source.ConnectableAPI(), ShadingNetwork(images, material.GetPath(), time), "diffuse"
+            )
             amount, scale = inputs.scalar("displacement", 0.0), inputs.scalar("scale", 1.0)
             value = combine("displacement", lambda d, s: d * s, amount, scale)
             return None if value.highest == value.lowest == 0.0 else value
@@ -131,9 +135,9 @@ class _NetworkInputs:
     """Evaluates the inputs of a surface shader."""
 
     def __init__(
-        self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, black_metals: bool, displaces: bool = False
+        self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, reflection: str, displaces: bool = False
     ) -> None:
-        self._shader, self.network, self.black_metals, self.displaces = shader, network, black_metals, displaces
+        self._shader, self.network, self.reflection, self.displaces = shader, network, reflection, displaces
         self.warn = network.warn
 
     def color(self, name: str, default: Color) -> ShadingValue:
@@ -241,14 +245,48 @@ def _mean_channel(pixels: Floats) -> Floats:
     return np.asarray(pixels[..., :3].mean(axis=-1, keepdims=True))
 
 
+@dataclass(frozen=True)
+class _GlossInputs:
+    """The inputs of a `Gloss`, as values that may be images."""
+
+    base_color: ShadingValue
+    metallic: ShadingValue
+    roughness: ShadingValue
+    ior: float
+    clearcoat: ShadingValue
+    clearcoat_roughness: ShadingValue
+    specular_weight: float = 1.0
+    specular_color: ShadingValue | None = None
+
+    def evaluated(self, inputs: _NetworkInputs) -> Gloss:
+        """The record, with images where the network has them; primvars other than the colour's take their fallback."""
+        values: dict[str, Any] = {}
+        for name in _GLOSS_VALUES:
+            value: ShadingValue | None = getattr(self, name)
+            if value is None:
+                continue
+            if name != "base_color":
+                inputs.warn_primvar_fallbacks(name, value)
+            value = combine("clip", _clamp01, value)
+            if value.mapping is not None:
+                values[f"{name}_texture"] = inputs.network.texture(_with_bounded_border(value))
+            values[name] = _rgb(value.mean) if name.endswith("color") else float(value.mean[0])
+        ior = self.ior
+        if not 0.0 < ior < math.inf:
+            inputs.warn(f"ior {ior:g} is not positive; 1.5 is used ({{n}} materials)")
+            ior = 1.5
+        return Gloss(ior=ior, specular_weight=min(max(self.specular_weight, 0.0), 1.0), **values)
+
+
 def _preview_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     """UsdPreviewSurface; MaterialX's node of the same name has the same inputs."""
-    albedo = inputs.color("diffuseColor", _GREY)
+    albedo = base = inputs.color("diffuseColor", _GREY)
+    specular: ShadingValue | None = None
     if inputs.number("useSpecularWorkflow", 0.0) > 0.5:
         specular = combine("clip", _clamp01, inputs.color("specularColor", _BLACK))
         if specular.highest > 0.0:
             albedo = combine("specular", lambda d, s: d * (1.0 - s) + s, albedo, specular)
-        if specular.highest > 0.05:
+        if specular.highest > 0.05 and inputs.reflection != "all":
             inputs.warn("specular reflection is rendered as diffuse ({n} materials)")
     else:
         albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 0.0), albedo)
@@ -257,7 +295,16 @@ def _preview_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     if threshold <= 0.0 and inputs.token("opacityMode") != "presence" and emission.highest > 0.0:
         # In mode `transparent` opacity does not dim emission, but the renderer reduces the emission by it.
         emission = combine("glow", lambda e, o: e / np.clip(o, _MIN_OPACITY, 1.0), emission, opacity)
-    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
+    gloss = _GlossInputs(
+        base,
+        inputs.scalar("metallic", 0.0),
+        inputs.scalar("roughness", 0.5),
+        inputs.number("ior", 1.5),
+        specular_color=specular,
+        clearcoat=inputs.scalar("clearcoat", 0.0),
+        clearcoat_roughness=inputs.scalar("clearcoatRoughness", 0.01),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True), gloss)
 
 
 def _standard_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -266,12 +313,20 @@ def _standard_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _weighted(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.scalar("base", 1.0))
     emission = _weighted(inputs.color("emission_color", _WHITE), inputs.scalar("emission", 0.0))
-    albedo = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
+    albedo = base = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
     albedo = _tinted_by_coat(inputs, "coat", _metal_as_diffuse(inputs, inputs.scalar("metalness", 0.0), albedo))
     inputs.warn_unrendered_lobe("sheen", "sheen")
-    return _evaluated(
-        inputs, albedo, emission, inputs.scalar("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False)
+    gloss = _GlossInputs(
+        base,
+        inputs.scalar("metalness", 0.0),
+        inputs.scalar("specular_roughness", 0.2),
+        inputs.number("specular_IOR", 1.5),
+        specular_weight=inputs.number("specular", 1.0),
+        clearcoat=inputs.scalar("coat", 0.0),
+        clearcoat_roughness=inputs.scalar("coat_roughness", 0.1),
     )
+    opacity, normal = inputs.scalar("opacity", 1.0), inputs.normal("normal", tangent=False)
+    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal, gloss)
 
 
 def _open_pbr_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -280,25 +335,44 @@ def _open_pbr_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _weighted(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.scalar("base_weight", 1.0))
     emission = _weighted(inputs.color("emission_color", _WHITE), inputs.scalar("emission_luminance", 0.0))
-    albedo = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
+    albedo = base = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
     albedo = _tinted_by_coat(
         inputs, "coat_weight", _metal_as_diffuse(inputs, inputs.scalar("base_metalness", 0.0), albedo)
     )
     inputs.warn_unrendered_lobe("fuzz_weight", "sheen")
     opacity, normal = inputs.scalar("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
-    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal)
+    gloss = _GlossInputs(
+        base,
+        inputs.scalar("base_metalness", 0.0),
+        inputs.scalar("specular_roughness", 0.3),
+        inputs.number("specular_ior", 1.5),
+        specular_weight=inputs.number("specular_weight", 1.0),
+        clearcoat=inputs.scalar("coat_weight", 0.0),
+        clearcoat_roughness=inputs.scalar("coat_roughness", 0.0),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal, gloss)
 
 
 def _gltf_pbr(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     """MaterialX's glTF PBR material."""
     if inputs.number("transmission", 0.0) > 0.0:
         inputs.warn("transmission is not rendered: the surface is opaque")
-    albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 1.0), inputs.color("base_color", _WHITE))
+    base = inputs.color("base_color", _WHITE)
+    albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 1.0), base)
     emission = _weighted(inputs.color("emissive", _BLACK), inputs.scalar("emissive_strength", 1.0))
     mode = round(inputs.number("alpha_mode", 0.0))  # 0: OPAQUE, 1: MASK, 2: BLEND
     opacity = inputs.scalar("alpha", 1.0) if mode else constant(1.0)
     threshold = inputs.number("alpha_cutoff", 0.5) if mode == 1 else 0.0
-    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=False))
+    gloss = _GlossInputs(
+        base,
+        inputs.scalar("metallic", 1.0),
+        inputs.scalar("roughness", 1.0),
+        inputs.number("ior", 1.5),
+        specular_weight=inputs.number("specular", 1.0),
+        clearcoat=inputs.scalar("clearcoat", 0.0),
+        clearcoat_roughness=inputs.scalar("clearcoat_roughness", 0.0),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=False), gloss)
 
 
 def _surface_unlit(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -332,10 +406,12 @@ def _weighted(color: ShadingValue, weight: ShadingValue) -> ShadingValue:
 
 
 def _metal_as_diffuse(inputs: _NetworkInputs, metallic: ShadingValue, albedo: ShadingValue) -> ShadingValue:
-    """The albedo where the surface is a metal: its base colour, or 0 if metals are black."""
+    """The albedo where the surface is a metal: its base colour, or 0 if metals are black; gloss counts on its own."""
     if metallic.highest <= 0.0 and not metallic.primvars:
         return albedo
-    if not inputs.black_metals:
+    if inputs.reflection != "black":
+        if inputs.reflection == "all":
+            return albedo
         inputs.warn("metal is rendered as a diffuse surface of its base colour ({n} materials)")
         return albedo
     inputs.warn("metal is rendered without its reflection ({n} materials)")
@@ -380,6 +456,7 @@ def _evaluated(
     opacity: ShadingValue,
     threshold: float,
     normal: ShadingValue | None,
+    gloss: "_GlossInputs | None" = None,
 ) -> EvaluatedMaterial | None:
     """The evaluated material with an albedo in [0, 1] and a non-negative emission; None: opacity is 0."""
     if albedo.lowest < 0.0 or albedo.highest > 1.0:
@@ -424,6 +501,7 @@ def _evaluated(
         emission_texture,
         opacity_texture,
         normal_texture=None if normal is None else network.texture(normal),
+        gloss=None if gloss is None or inputs.reflection != "all" else gloss.evaluated(inputs),
     )
     albedo_value, emission_value, opacity_value = (x if x.primvars else None for x in (albedo, emission, opacity))
     return EvaluatedMaterial(material, albedo_value, emission_value, opacity_value, threshold, displacement)
