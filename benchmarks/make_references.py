@@ -35,6 +35,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import mitsuba_gloss
 import numpy as np
 
 import warp_ir as ir
@@ -117,6 +118,9 @@ def _mesh(mi: ModuleType, mesh: Mesh, scene: Scene, index: int) -> "mitsuba.Mesh
     else:
         reflectance = {"type": "mesh_attribute", "name": "vertex_color"} if coloured else _rgb(material.albedo)
     bsdf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
+    if material.gloss is not None:
+        mitsuba_gloss.register(mi)
+        bsdf = mitsuba_gloss.description(material.gloss)
     properties["bsdf"] = mi.load_dict(bsdf)
     if emissive:
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(material.emission)})

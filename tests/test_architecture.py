@@ -24,7 +24,7 @@ LAYERS = [
     ["device"],
     ["sampling"],
     ["procedural", "usd", "bvh", "texture", "tiles"],
-    ["light_modifiers"],
+    ["light_modifiers", "bsdf"],
     ["device_scene"],
     ["surface"],
     ["lights"],

@@ -763,3 +763,31 @@ def test_a_subset_that_reads_primvars_leaves_the_other_faces_unbound(tmp_path):
     mesh_read = load(tmp_path, reader + mesh_text).meshes[0]
     np.testing.assert_allclose(mesh_read.colors[0], np.eye(3))
     np.testing.assert_allclose(mesh_read.colors[1], 0.18)
+
+
+GLOSSY = """
+    color3f inputs:diffuseColor = (0.5, 0.25, 0.125)
+    float inputs:metallic = 0.75
+    float inputs:roughness = 0.3
+    float inputs:ior = 1.25
+    float inputs:clearcoat = 0.5
+    float inputs:clearcoatRoughness = 0.2"""
+
+
+def test_gloss_is_read_on_request(tmp_path):
+    """With materials "all", the parameters of UsdPreviewSurface beside its albedo are those of `Gloss`."""
+    text = material_text(GLOSSY) + mesh()
+    assert only_material(load(tmp_path, text)).gloss is None
+    gloss = only_material(load(tmp_path, text, materials="all")).gloss
+    found = gloss.base_color, gloss.metallic, gloss.roughness, gloss.ior, gloss.clearcoat, gloss.clearcoat_roughness
+    assert np.allclose(np.hstack(found), [0.5, 0.25, 0.125, 0.75, 0.3, 1.25, 0.5, 0.2]) and gloss.specular_color is None
+    with pytest.raises(ir.InputError, match="metals: 'black' has no effect"):
+        load(tmp_path, text, materials="all", metals="black")
+
+
+def test_gloss_of_the_specular_workflow(tmp_path):
+    """The specular workflow gives the reflectance at normal incidence; nothing is said to be approximated."""
+    text = material_text("int inputs:useSpecularWorkflow = 1\n color3f inputs:specularColor = (0.5, 0.25, 0.75)")
+    scene = load(tmp_path, text + mesh(), materials="all")
+    assert only_material(scene).gloss.specular_color == (0.5, 0.25, 0.75)
+    assert not [line for line in scene.warnings if "specular" in line]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from warp_ir.renderer import Renderer as Renderer
     from warp_ir.renderer import render as render
     from warp_ir.scene import Camera as Camera
+    from warp_ir.scene import Gloss as Gloss
     from warp_ir.scene import InputError as InputError
     from warp_ir.scene import Instances as Instances
     from warp_ir.scene import Light as Light
@@ -43,6 +44,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Camera": "scene",
+    "Gloss": "scene",
     "InputError": "scene",
     "Instances": "scene",
     "Light": "scene",

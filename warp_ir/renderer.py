@@ -25,7 +25,7 @@ from warp_ir.device.graph import RepeatedLaunches
 from warp_ir.device.launcher import Cancelled, Launcher
 from warp_ir.device.scratch import Scratch
 from warp_ir.device_scene import CameraData, DeviceScene, camera_data, upload_scenes
-from warp_ir.estimators import ESTIMATORS, Estimator
+from warp_ir.estimators import Estimator, estimator_of
 from warp_ir.film import ACCUMULATE_MODULES, Film
 from warp_ir.film.denoise import denoise_seconds
 from warp_ir.gbuffer import GBuffer, new_gbuffer
@@ -108,10 +108,10 @@ class Renderer:
         with self.launcher.exclusive:
             self.launcher.profile.clear()
             self._reported = {}, {}
-            before = self._resolved
+            before, estimator = self._resolved, self._estimator
             self._take_settings(scene, settings)
             with self.launcher.loading():
-                if self._resolved.estimator != before.estimator:
+                if self._estimator is not estimator:
                     self.launcher.load(self._estimator_modules())
                 if self._resolved.filter and not before.filter:
                     self.launcher.load(FILTER_MODULES)
@@ -272,8 +272,8 @@ class Renderer:
 
     def _estimator_modules(self) -> list[ModuleType]:
         """The modules of kernels that the estimator needs on this device."""
-        estimator = ESTIMATORS[self._resolved.estimator]
-        return [*estimator.MODULES, *(estimator.WAVEFRONT_MODULES if self.launcher.wavefront else [])]
+        waves = self._estimator.WAVEFRONT_MODULES if self.launcher.wavefront else []
+        return [*self._estimator.MODULES, *waves]
 
     def _take_settings(self, scene: Scene, settings: RenderSettings | None = None) -> None:
         """Fills in what depends on the scene's camera, and refuses pictures too large for the memory.
@@ -281,6 +281,7 @@ class Renderer:
         If it refuses, the settings stay as they were.
         """
         wanted = settings or self.wanted
+        estimator = estimator_of(wanted.estimator, scene)
         resolved = wanted.resolve(scene.camera.aspect, self.guiding, self.launcher.max_light_paths())
         definite = replace(wanted, height=resolved.height)
         _, _, columns, rows = definite.pixels()
@@ -292,6 +293,7 @@ class Renderer:
                 f" {self.launcher.device} has {gibibytes(available)}"
             )
         self.wanted, self.settings, self._resolved, self._held = wanted, definite, resolved, needed
+        self._estimator = estimator
 
     def _upload(self, scene: Scene) -> None:
         """Uploads every shutter sample of the scene, and allocates the buffers that an iteration fills in."""
@@ -304,7 +306,7 @@ class Renderer:
         for sample, device_scene in zip(scenes, uploaded, strict=True):
             camera = camera_data(sample.camera, device_scene.frame, self.settings)
             camera.blurs = int(camera.blurs == 1 or len(scenes) > 1)
-            estimator = ESTIMATORS[settings.estimator](device_scene, camera, settings, self._scratch)
+            estimator = self._estimator(device_scene, camera, settings, self._scratch)
             launches = RepeatedLaunches(self._scratch)
             self._shutter.append(_ShutterState(device_scene, camera, estimator, sample.camera.exposure, launches))
         if camera.blurs and settings.filter:

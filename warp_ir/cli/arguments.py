@@ -677,6 +677,13 @@ def _add_stage(parser: argparse.ArgumentParser, *, frames: bool = True) -> None:
         help="render metals as diffuse surfaces of their base colour, or as black (default: diffuse)",
     )
     group.add_argument(
+        "--materials",
+        choices=("diffuse", "all"),
+        default="diffuse",
+        help="what surfaces reflect: alike in all directions, or all of it, gloss and mirrors too, which only"
+        " --estimator path renders (default: diffuse)",
+    )
+    group.add_argument(
         "--texture-wrap",
         choices=("black", "clamp", "repeat", "mirror"),
         default="black",

@@ -34,6 +34,7 @@ def reader_options(args: argparse.Namespace) -> dict[str, Any]:
         complexity=args.complexity,
         default_light=args.default_light,
         metals=args.metals,
+        materials=args.materials,
         texture_wrap=args.texture_wrap,
         strict=args.strict,
         render_settings=args.render_settings,

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_ir.bsdf import AlbedoTable
 from warp_ir.bvh import Bvh, Instance, TwoLevel
 from warp_ir.light_modifiers import LightModifierTables
 from warp_ir.sampling.distribution2d import Distribution2DTables
@@ -17,6 +18,36 @@ TRIANGLE_EMITTER = len(LightKind)
 
 
 @wp.struct
+class GlossRow:
+    """The parameters of a `Gloss`, and rows of textures.rows that replace them; -1: none."""
+
+    enabled: int  # 0: the material is Lambertian
+    base_color: wp.vec3
+    base_color_texture: int
+    metallic: float
+    metallic_texture: int
+    has_specular_color: int  # 1: specular_color takes the place of metallic and f0
+    specular_color: wp.vec3
+    specular_color_texture: int
+    f0: float  # of the dielectric and of the clearcoat
+    specular_weight: float  # factor of what the dielectric reflects
+    roughness: float
+    roughness_texture: int
+    clearcoat: float
+    clearcoat_texture: int
+    clearcoat_roughness: float
+    clearcoat_roughness_texture: int
+
+
+@wp.struct
+class GlossTables:
+    """What materials reflect by direction."""
+
+    rows: wp.array[GlossRow]  # [materials]
+    albedo: AlbedoTable
+
+
+@wp.struct
 class SurfaceTextures:
     """Textures and texture coordinates of surfaces, normal maps, and emission that only the camera receives."""
 
@@ -28,6 +59,7 @@ class SurfaceTextures:
     camera_emission: wp.array[wp.vec3]  # [materials], radiance to the camera in place of the emission; negative: unset
     camera_emission_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
     normal_texture: wp.array[wp.int32]  # [materials], row of textures.rows; -1: none
+    gloss: GlossTables  # empty if no material has a `Gloss`
 
 
 @wp.struct
@@ -70,6 +102,7 @@ class SceneData:
     tinted: int  # 1: the colour of an instance multiplies the texture of a triangle that has `INSTANCE_COLOR`
     normal_map_count: int  # materials with a normal map
     surface_textures: wp.array[SurfaceTextures]  # one row: calls pass a pointer instead of copying the record
+    gloss_count: int  # materials with a `Gloss`
     non_opaque_count: int  # materials whose opacity is below 1 anywhere
     camera_emission_count: int  # materials whose emission to the camera differs from that to surfaces
     footprint: float  # width of the surface patch over which indirect light averages textures

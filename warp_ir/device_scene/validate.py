@@ -106,7 +106,20 @@ def _check_material(material: Material) -> None:
         placed = texture.transform.shape == (2, 3) and np.isfinite(texture.transform.astype(np.float32)).all()
         demand(placed, f"texture {texture.name}: transform must be a finite 2x3 matrix")
         demand(np.isfinite(texture.outside).all(), f"texture {texture.name}: outside must be finite")
-    for bounded in (material.albedo_texture, material.opacity_texture):
+    gloss = material.gloss
+    if gloss is not None:
+        colors = (*gloss.base_color, *(gloss.specular_color or ()))
+        shares = (
+            gloss.metallic,
+            gloss.specular_weight,
+            gloss.roughness,
+            gloss.clearcoat,
+            gloss.clearcoat_roughness,
+            *colors,
+        )
+        demand(all(0.0 <= x <= 1.0 for x in shares), "colours, metallic, roughness and clearcoat must lie in [0, 1]")
+        demand(0.0 < gloss.ior < math.inf, f"ior must be positive, is {gloss.ior:g}")
+    for bounded in (material.albedo_texture, material.opacity_texture, *(gloss.textures if gloss else ())):
         if bounded is not None:
             top = max(value_range(bounded.pixels)[1], *bounded.outside)
             demand(top <= 1.0 and min(bounded.outside) >= 0.0, f"texture {bounded.name}: values must lie in [0, 1]")

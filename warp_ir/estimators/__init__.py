@@ -15,6 +15,7 @@ from warp_ir.estimators.keller import Keller
 from warp_ir.estimators.path import PathTracer
 from warp_ir.estimators.vpl import VplEstimator
 from warp_ir.gbuffer import GBuffer
+from warp_ir.scene import InputError, Scene
 from warp_ir.settings import ResolvedSettings
 
 
@@ -41,3 +42,18 @@ class Estimator(Protocol):
 
 ESTIMATORS: dict[str, type[Estimator]] = {"vpl": VplEstimator, "keller": Keller, "path": PathTracer}
 """By the names that `RenderSettings.estimator` takes."""
+
+
+def estimator_of(name: str, scene: Scene) -> type[Estimator]:
+    """The estimator of that name for a scene.
+
+    Raises:
+        InputError: The scene has gloss, which the estimator does not render.
+    """
+    if all(material.gloss is None for material in scene.materials):
+        return ESTIMATORS[name]
+    if name != "path":
+        raise InputError(f"estimator: {name} reflects diffusely, and the scene has gloss, which path renders")
+    from warp_ir.estimators.glossy_path import GlossyPathTracer  # not read for scenes without gloss
+
+    return GlossyPathTracer

@@ -113,6 +113,61 @@ class Texture:
 
 
 @dataclass(frozen=True)
+class Gloss:
+    """How a surface reflects by direction: microfacets over a diffuse base, below a clearcoat (UsdPreviewSurface).
+
+    A dielectric reflects ((ior - 1) / (ior + 1))² at normal incidence and everything at grazing incidence; a metal its
+    base colour. The mean of a texture replaces the constant that it stands in for.
+    """
+
+    base_color: Color = (0.18, 0.18, 0.18)
+    """Albedo of the diffuse base, in [0, 1]; of a metal the reflectance."""
+    metallic: float = 0.0
+    """0: a dielectric, 1: a metal."""
+    specular_color: Color | None = None
+    """Reflectance at normal incidence, in [0, 1], in place of `metallic` and `ior`: the specular workflow."""
+    roughness: float = 0.5
+    """In [0, 1]; its square is the α of the distribution GGX of normals. Below 0.032 the surface is a mirror."""
+    ior: float = 1.5
+    """Index of refraction of the dielectric, and of the clearcoat."""
+    specular_weight: float = 1.0
+    """Factor, in [0, 1], of what the dielectric reflects at its surface."""
+    clearcoat: float = 0.0
+    """Weight of the clearcoat, in [0, 1]."""
+    clearcoat_roughness: float = 0.01
+    """Like `roughness`."""
+    base_color_texture: Texture | None = None
+    metallic_texture: Texture | None = None
+    specular_color_texture: Texture | None = None
+    roughness_texture: Texture | None = None
+    clearcoat_texture: Texture | None = None
+    clearcoat_roughness_texture: Texture | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("base_color", "specular_color"):
+            image = getattr(self, f"{name}_texture")
+            if image is not None:
+                object.__setattr__(self, name, image.mean)
+        for name in ("metallic", "roughness", "clearcoat", "clearcoat_roughness"):
+            image = getattr(self, f"{name}_texture")
+            if image is not None:
+                object.__setattr__(self, name, image.mean[0])
+
+    @property
+    def textures(self) -> tuple[Texture, ...]:
+        """All textures of these parameters."""
+        images = (
+            self.base_color_texture,
+            self.metallic_texture,
+            self.specular_color_texture,
+            self.roughness_texture,
+            self.clearcoat_texture,
+            self.clearcoat_roughness_texture,
+        )
+        return tuple(image for image in images if image is not None)
+
+
+@dataclass(frozen=True)
 class Material:
     """A Lambertian surface that may emit. The mean of a texture replaces the constant that it stands in for."""
 
@@ -136,6 +191,8 @@ class Material:
     normal_texture: Texture | None = None
     """Tangent-space normals [x, y, z] of any length: x in the direction in which the texture coordinate u grows, y in
     that of v, z out of the front. They shade what camera rays hit. A mesh without those coordinates ignores them."""
+    gloss: Gloss | None = None
+    """What `RenderSettings.materials` "all" reflects in place of `albedo`; None: a Lambertian surface."""
 
     def __post_init__(self) -> None:
         if self.albedo_texture is not None:
@@ -157,7 +214,8 @@ class Material:
             self.glow_texture,
             self.normal_texture,
         )
-        return tuple(image for image in images if image is not None)
+        own = tuple(image for image in images if image is not None)
+        return own if self.gloss is None else own + self.gloss.textures
 
 
 @dataclass(frozen=True, eq=False)

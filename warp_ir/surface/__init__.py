@@ -1,7 +1,15 @@
 """Surfaces as rays meet them: ray queries, ray origins, and the material and normals at a hit."""
 
 from warp_ir.surface.hit import Hit, scene_at
-from warp_ir.surface.material import albedo, alpha_at, camera_emission, emission, emission_at, has_camera_emission
+from warp_ir.surface.material import (
+    albedo,
+    alpha_at,
+    bsdf_at,
+    camera_emission,
+    emission,
+    emission_at,
+    has_camera_emission,
+)
 from warp_ir.surface.normals import mapped_normal, shading_normal, smooth_height
 from warp_ir.surface.offset import offset_ray_origin, spawn_ray_origin
 from warp_ir.surface.ray_query import SHADOW_RAY_END, closest, visible
@@ -19,6 +27,7 @@ __all__ = [
     "ShadingPoint",
     "albedo",
     "alpha_at",
+    "bsdf_at",
     "camera_emission",
     "closest",
     "emission",

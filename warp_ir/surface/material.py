@@ -2,8 +2,9 @@
 
 import warp as wp
 
+from warp_ir.bsdf import Bsdf
 from warp_ir.device_scene import INSTANCE_COLOR, SceneData, SurfaceTextures
-from warp_ir.surface.hit import Hit
+from warp_ir.surface.hit import Hit, scene_at
 from warp_ir.texture import lookup, mip_level, uv_to_st
 
 wp.set_module_options({"enable_backward": False})
@@ -122,3 +123,50 @@ def camera_emission(scene: SceneData, hit: Hit, footprint: float) -> wp.vec3:
     if texture >= 0:
         return _texture_at(scene.surface_textures, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
     return scene.surface_textures[0].camera_emission[material]
+
+
+@wp.func
+def _gloss_texture(scene: SceneData, hit: Hit, texture: int, constant: wp.vec3, footprint: float) -> wp.vec3:
+    """A parameter of the gloss: a texture, if there is one."""
+    if texture < 0:
+        return constant
+    return _texture_at(scene.surface_textures, texture, hit.triangle, hit.u, hit.v, hit.area, footprint)
+
+
+@wp.func(inline=False)
+def bsdf_at(address: wp.uint64, hit: Hit, footprint: float) -> Bsdf:
+    """The parameters of what a hit reflects, textures as means over a patch of width `footprint`.
+
+    In scenes whose `gloss_count` is not 0. Of the workflows of UsdPreviewSurface, the metallic one has F0 = c R and
+    F90 = c with c from 1 to the base colour, and the specular one F90 = 1.
+    """
+    scene = scene_at(address)[0]
+    row = scene.surface_textures[0].gloss.rows[scene.triangle_material[hit.triangle]]
+    out = Bsdf()
+    if row.enabled == 0:
+        out.diffuse = albedo(scene, hit, footprint)
+        return out
+    base = _gloss_texture(scene, hit, row.base_color_texture, row.base_color, footprint)
+    if row.base_color_texture < 0 and scene.triangle_colors[hit.triangle] != -1:
+        base = albedo(scene, hit, footprint)
+    roughness = _gloss_texture(scene, hit, row.roughness_texture, wp.vec3(row.roughness), footprint)[0]
+    out.diffuse = base
+    out.alpha = roughness * roughness
+    if row.has_specular_color == 1:
+        out.f0 = _gloss_texture(scene, hit, row.specular_color_texture, row.specular_color, footprint)
+        out.f90 = wp.vec3(1.0)
+    else:
+        metallic = _gloss_texture(scene, hit, row.metallic_texture, wp.vec3(row.metallic), footprint)[0]
+        dielectric = (1.0 - metallic) * row.specular_weight
+        tint = wp.vec3(1.0 - metallic) + base * metallic
+        out.f90 = tint * (metallic + dielectric)
+        out.f0 = tint * (metallic + row.f0 * dielectric)
+        out.diffuse = base * (1.0 - metallic)
+    out.coat = _gloss_texture(scene, hit, row.clearcoat_texture, wp.vec3(row.clearcoat), footprint)[0]
+    if out.coat > 0.0:
+        rough = _gloss_texture(
+            scene, hit, row.clearcoat_roughness_texture, wp.vec3(row.clearcoat_roughness), footprint
+        )[0]
+        out.coat_f0 = row.f0
+        out.coat_alpha = rough * rough
+    return out

@@ -86,7 +86,7 @@ def build_meshes(
     levels: int = 0,
     shapes: ShapeCache | None = None,
     images: ImageCache | None = None,
-    metals: str = "diffuse",
+    reflection: str = "diffuse",
     purposes: Sequence[str] = PURPOSES[:2],
     links: LightLinks | None = None,
     times: int = 1,
@@ -101,7 +101,7 @@ def build_meshes(
         levels: Refinement levels of subdivision surfaces.
         shapes: Cache of shapes; new ones are added.
         images: Cache of images; new ones are added.
-        metals: "diffuse" or "black".
+        reflection: "diffuse", "black" (diffuse without metals) or "all".
         purposes: Purposes of material bindings, in order of preference.
         links: Light links, by which copies of a gprim may differ.
         times: Number of shutter samples for which the gprims are read.
@@ -110,7 +110,7 @@ def build_meshes(
     Raises:
         InputError: There are more triangles than can be rendered.
     """
-    table = MaterialTable(time, report, images, metals, purposes, displaces=levels > 0)
+    table = MaterialTable(time, report, images, reflection, purposes, displaces=levels > 0)
     shape_cache = {} if shapes is None else shapes
     builder = _MeshBuilder(time, report, levels, table, shape_cache, links or LightLinks(()), pixel)
     return builder.run(gprims, times)

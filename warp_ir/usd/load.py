@@ -77,6 +77,7 @@ class StageOptions(TypedDict, total=False):
     complexity: str
     default_light: str
     metals: str
+    materials: str
     texture_wrap: str
     strict: bool
     render_settings: str | None
@@ -126,6 +127,7 @@ class StageReader:
         complexity: str = "low",
         default_light: str = "dome",
         metals: str = "diffuse",
+        materials: str = "diffuse",
         texture_wrap: str = "black",
         strict: bool = False,
         render_settings: str | None = None,
@@ -150,6 +152,8 @@ class StageReader:
             default_light: What to do if nothing emits: "dome" adds a uniform white dome of radiance 1, "sky" an
                 overcast sky over grey ground, "none" nothing.
             metals: "diffuse" renders a metal as a diffuse surface of its base colour, "black" without its reflection.
+            materials: "diffuse" reads what is reflected alike in all directions, "all" gloss and mirrors as well, which
+                the estimator `path` renders.
             texture_wrap: Wrap mode of textures for which the file gives none: "black" (the specification's default),
                 "clamp", "repeat" or "mirror".
             strict: Whether the first warning is an error.
@@ -175,6 +179,10 @@ class StageReader:
             raise InputError(f"default_light: '{default_light}' is not one of 'dome', 'sky', 'none'")
         if metals not in ("diffuse", "black"):
             raise InputError(f"metals: '{metals}' is neither 'diffuse' nor 'black'")
+        if materials not in ("diffuse", "all"):
+            raise InputError(f"materials: '{materials}' is neither 'diffuse' nor 'all'")
+        if materials == "all" and metals != "diffuse":
+            raise InputError(f"metals: '{metals}' has no effect with materials 'all'")
         if texture_wrap not in ("black", "clamp", "repeat", "mirror"):
             raise InputError(f"texture_wrap: '{texture_wrap}' is not one of black, clamp, repeat, mirror")
         if render_settings is not None and render_pass is not None:
@@ -187,7 +195,8 @@ class StageReader:
         self._render_settings, self._motion_blur = render_settings, motion_blur
         self._levels = _REFINEMENT_LEVELS[complexity]
         self._open_report = Report(self.source, strict=strict)
-        self._metals, self._images = metals, ImageCache(self._open_report, texture_wrap)
+        self._reflection = "all" if materials == "all" else metals
+        self._images = ImageCache(self._open_report, texture_wrap)
         with self._reading():
             self.stage = open_stage(
                 self.source,
@@ -398,7 +407,7 @@ class StageReader:
                 read,
                 self._levels,
                 images=self._images,
-                metals=self._metals,
+                reflection=self._reflection,
                 purposes=key.material_purposes,
                 links=links,
                 pixel=self._pixel,
@@ -435,7 +444,7 @@ class StageReader:
                     self._levels,
                     shape_cache,
                     self._images,
-                    self._metals,
+                    self._reflection,
                     self._time_varying.purposes,
                     static.links,
                     self._times,

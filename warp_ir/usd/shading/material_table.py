@@ -73,7 +73,7 @@ class MaterialTable:
         time: Time code of all values.
         report: Receives warnings.
         images: Cache of images; None: a new one.
-        metals: "diffuse" or "black".
+        reflection: "diffuse", "black" (diffuse without metals) or "all".
         purposes: Purposes of material bindings, in order of preference.
         displaces: Whether displacements are read.
     """
@@ -83,7 +83,7 @@ class MaterialTable:
         time: Usd.TimeCode,
         report: Report,
         images: ImageCache | None = None,
-        metals: str = "diffuse",
+        reflection: str = "diffuse",
         purposes: Sequence[str] = PURPOSES[:2],
         *,
         displaces: bool = False,
@@ -94,7 +94,7 @@ class MaterialTable:
         self.materials: list[Material] = []
         self._purposes = purposes
         self._time, self._report = time, report
-        self._images, self._black_metals = images or ImageCache(report), metals == "black"
+        self._images, self._reflection = images or ImageCache(report), reflection
         self._images.report = report
         self._fields: dict[int, EvaluatedMaterial] = {}
         self._baked_images: dict[Hashable, ShadingValue] = {}
@@ -541,7 +541,7 @@ class MaterialTable:
         if path not in self._index_by_path:
             try:
                 evaluated = read_material(
-                    material, self._time, self._images, black_metals=self._black_metals, displaces=self._displaces
+                    material, self._time, self._images, reflection=self._reflection, displaces=self._displaces
                 )
                 self._index_by_path[path] = TRANSPARENT if evaluated is None else self.add(evaluated.material)
                 if evaluated is not None and self._displaces:

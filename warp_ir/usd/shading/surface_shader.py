@@ -7,11 +7,12 @@ that share of the rays pass undeflected; emission is reduced by it as well.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from warp_ir.scene import MAX_RADIANCE, Color, Floats, Material, Wrap
+from warp_ir.scene import MAX_RADIANCE, Color, Floats, Gloss, Material, Wrap
 from warp_ir.usd.images.cache import ImageCache
 from warp_ir.usd.images.shading_value import ShadingValue, UVMapping, as_color, combine, constant
 from warp_ir.usd.shading.network import ShadingNetwork
@@ -58,7 +59,7 @@ def read_material(
     time: Usd.TimeCode,
     images: ImageCache,
     *,
-    black_metals: bool = False,
+    reflection: str = "diffuse",
     displaces: bool = False,
 ) -> EvaluatedMaterial | None:
     """Evaluates a bound material; None: its opacity is 0 everywhere.
@@ -67,7 +68,7 @@ def read_material(
         material: The material.
         time: Time code of all values.
         images: Cache of images.
-        black_metals: Whether metals keep only their diffuse lobe.
+        reflection: "diffuse"; "black": metals keep only their diffuse lobe; "all": gloss as well.
         displaces: Whether the displacement is wanted; else a warning says that it is not rendered.
 
     Raises:
@@ -90,7 +91,7 @@ def read_material(
     if any(not (displaces and source.GetShaderId() == _DISPLACEMENT) for source in unsupported):
         images.report.warn(path, "displacement is not rendered ({n} materials)")
     inputs = [
-        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), black_metals, displaces)
+        _NetworkInputs(shader.ConnectableAPI(), ShadingNetwork(images, path, time), reflection, displaces)
         for shader in shaders
     ]
     for shader, shader_inputs in zip(shaders, inputs, strict=True):
@@ -128,7 +129,9 @@ def read_displacement(material: UsdShade.Material, time: Usd.TimeCode, images: I
     for context in ("mtlx", ""):
         source = material.ComputeDisplacementSource(context)[0]
         if source and source.GetShaderId() == _DISPLACEMENT:
-            inputs = _NetworkInputs(source.ConnectableAPI(), ShadingNetwork(images, material.GetPath(), time), False)
+            inputs = _NetworkInputs(
+                source.ConnectableAPI(), ShadingNetwork(images, material.GetPath(), time), "diffuse"
+            )
             amount, scale = inputs.scalar("displacement", 0.0), inputs.scalar("scale", 1.0)
             value = combine("displacement", lambda d, s: d * s, amount, scale)
             return None if value.highest == value.lowest == 0.0 else value
@@ -139,9 +142,9 @@ class _NetworkInputs:
     """Evaluates the inputs of a surface shader."""
 
     def __init__(
-        self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, black_metals: bool, displaces: bool = False
+        self, shader: UsdShade.ConnectableAPI, network: ShadingNetwork, reflection: str, displaces: bool = False
     ) -> None:
-        self._shader, self.network, self.black_metals, self.displaces = shader, network, black_metals, displaces
+        self._shader, self.network, self.reflection, self.displaces = shader, network, reflection, displaces
         self.warn = network.warn
 
     def color(self, name: str, default: Color) -> ShadingValue:
@@ -253,14 +256,61 @@ def _mean_channel(pixels: Floats) -> Floats:
     return np.asarray(pixels[..., :3].mean(axis=-1, keepdims=True))
 
 
+def _gloss(
+    inputs: _NetworkInputs,
+    base_color: ShadingValue,
+    *,
+    specular_color: ShadingValue | None = None,
+    **named: tuple[str, float],
+) -> Gloss | None:
+    """What is reflected by direction; None: it is not asked for, and nothing of it is read.
+
+    Primvars other than the colour's take their fallback.
+
+    Args:
+        inputs: The shader.
+        base_color: The colour of the base.
+        specular_color: The reflectance of the specular workflow.
+        named: Input and default of the other parameters of `Gloss`.
+    """
+    if inputs.reflection != "all":
+        return None
+    colors = {"base_color": base_color, "specular_color": specular_color}
+    given: dict[str, Any] = {}
+    for name, value in colors.items():
+        given |= {} if value is None else _gloss_parameter(inputs, name, value)
+    for name, (source, default) in named.items():
+        if name in ("ior", "specular_weight"):  # constants
+            given[name] = inputs.number(source, default)
+        else:
+            value = inputs.scalar(source, default)
+            inputs.warn_primvar_fallbacks(source, value)
+            given |= _gloss_parameter(inputs, name, value)
+    if not 0.0 < given["ior"] < math.inf:
+        inputs.warn(f"ior {given['ior']:g} is not positive; 1.5 is used ({{n}} materials)")
+        given["ior"] = 1.5
+    given["specular_weight"] = min(max(given.get("specular_weight", 1.0), 0.0), 1.0)
+    return Gloss(**given)
+
+
+def _gloss_parameter(inputs: _NetworkInputs, name: str, value: ShadingValue) -> dict[str, Any]:
+    """A parameter of `Gloss` in [0, 1], and its image if it has one."""
+    value = combine("clip", _clamp01, value)
+    constant = _rgb(value.mean) if name.endswith("color") else float(value.mean[0])
+    if value.mapping is None:
+        return {name: constant}
+    return {name: constant, f"{name}_texture": inputs.network.texture(_with_bounded_border(value))}
+
+
 def _preview_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     """UsdPreviewSurface; MaterialX's node of the same name has the same inputs."""
-    albedo = inputs.color("diffuseColor", _GREY)
+    albedo = base = inputs.color("diffuseColor", _GREY)
+    specular: ShadingValue | None = None
     if inputs.number("useSpecularWorkflow", 0.0) > 0.5:
         specular = combine("clip", _clamp01, inputs.color("specularColor", _BLACK))
         if specular.highest > 0.0:
             albedo = combine("specular", lambda d, s: d * (1.0 - s) + s, albedo, specular)
-        if specular.highest > 0.05:
+        if specular.highest > 0.05 and inputs.reflection != "all":
             inputs.warn("specular reflection is rendered as diffuse ({n} materials)")
     else:
         albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 0.0), albedo)
@@ -269,7 +319,17 @@ def _preview_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     if threshold <= 0.0 and inputs.token("opacityMode") != "presence" and emission.highest > 0.0:
         # In mode `transparent` opacity does not dim emission, but the renderer reduces the emission by it.
         emission = combine("glow", lambda e, o: e / np.clip(o, _MIN_OPACITY, 1.0), emission, opacity)
-    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True))
+    gloss = _gloss(
+        inputs,
+        base,
+        metallic=("metallic", 0.0),
+        roughness=("roughness", 0.5),
+        ior=("ior", 1.5),
+        specular_color=specular,
+        clearcoat=("clearcoat", 0.0),
+        clearcoat_roughness=("clearcoatRoughness", 0.01),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=True), gloss)
 
 
 def _standard_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -278,12 +338,21 @@ def _standard_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _weighted(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.scalar("base", 1.0))
     emission = _weighted(inputs.color("emission_color", _WHITE), inputs.scalar("emission", 0.0))
-    albedo = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
+    albedo = base = _scattering(inputs, "subsurface", "metalness", _WHITE, albedo)
     albedo = _tinted_by_coat(inputs, "coat", _metal_as_diffuse(inputs, inputs.scalar("metalness", 0.0), albedo))
     inputs.warn_unrendered_lobe("sheen", "sheen")
-    return _evaluated(
-        inputs, albedo, emission, inputs.scalar("opacity", 1.0), 0.0, inputs.normal("normal", tangent=False)
+    gloss = _gloss(
+        inputs,
+        base,
+        metallic=("metalness", 0.0),
+        roughness=("specular_roughness", 0.2),
+        ior=("specular_IOR", 1.5),
+        specular_weight=("specular", 1.0),
+        clearcoat=("coat", 0.0),
+        clearcoat_roughness=("coat_roughness", 0.1),
     )
+    opacity, normal = inputs.scalar("opacity", 1.0), inputs.normal("normal", tangent=False)
+    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal, gloss)
 
 
 def _open_pbr_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -292,25 +361,46 @@ def _open_pbr_surface(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
         inputs.warn("transmission is not rendered: the surface is opaque")
     albedo = _weighted(inputs.color("base_color", (0.8, 0.8, 0.8)), inputs.scalar("base_weight", 1.0))
     emission = _weighted(inputs.color("emission_color", _WHITE), inputs.scalar("emission_luminance", 0.0))
-    albedo = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
+    albedo = base = _scattering(inputs, "subsurface_weight", "base_metalness", (0.8, 0.8, 0.8), albedo)
     albedo = _tinted_by_coat(
         inputs, "coat_weight", _metal_as_diffuse(inputs, inputs.scalar("base_metalness", 0.0), albedo)
     )
     inputs.warn_unrendered_lobe("fuzz_weight", "sheen")
     opacity, normal = inputs.scalar("geometry_opacity", 1.0), inputs.normal("geometry_normal", tangent=False)
-    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal)
+    gloss = _gloss(
+        inputs,
+        base,
+        metallic=("base_metalness", 0.0),
+        roughness=("specular_roughness", 0.3),
+        ior=("specular_ior", 1.5),
+        specular_weight=("specular_weight", 1.0),
+        clearcoat=("coat_weight", 0.0),
+        clearcoat_roughness=("coat_roughness", 0.0),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, 0.0, normal, gloss)
 
 
 def _gltf_pbr(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
     """MaterialX's glTF PBR material."""
     if inputs.number("transmission", 0.0) > 0.0:
         inputs.warn("transmission is not rendered: the surface is opaque")
-    albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 1.0), inputs.color("base_color", _WHITE))
+    base = inputs.color("base_color", _WHITE)
+    albedo = _metal_as_diffuse(inputs, inputs.scalar("metallic", 1.0), base)
     emission = _weighted(inputs.color("emissive", _BLACK), inputs.scalar("emissive_strength", 1.0))
     mode = round(inputs.number("alpha_mode", 0.0))  # 0: OPAQUE, 1: MASK, 2: BLEND
     opacity = inputs.scalar("alpha", 1.0) if mode else constant(1.0)
     threshold = inputs.number("alpha_cutoff", 0.5) if mode == 1 else 0.0
-    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=False))
+    gloss = _gloss(
+        inputs,
+        base,
+        metallic=("metallic", 1.0),
+        roughness=("roughness", 1.0),
+        ior=("ior", 1.5),
+        specular_weight=("specular", 1.0),
+        clearcoat=("clearcoat", 0.0),
+        clearcoat_roughness=("clearcoat_roughness", 0.0),
+    )
+    return _evaluated(inputs, albedo, emission, opacity, threshold, inputs.normal("normal", tangent=False), gloss)
 
 
 def _surface_unlit(inputs: _NetworkInputs) -> EvaluatedMaterial | None:
@@ -344,10 +434,12 @@ def _weighted(color: ShadingValue, weight: ShadingValue) -> ShadingValue:
 
 
 def _metal_as_diffuse(inputs: _NetworkInputs, metallic: ShadingValue, albedo: ShadingValue) -> ShadingValue:
-    """The albedo where the surface is a metal: its base colour, or 0 if metals are black."""
+    """The albedo where the surface is a metal: its base colour, or 0 if metals are black; gloss counts on its own."""
     if metallic.highest <= 0.0 and not metallic.reads:
         return albedo
-    if not inputs.black_metals:
+    if inputs.reflection != "black":
+        if inputs.reflection == "all":
+            return albedo
         inputs.warn("metal is rendered as a diffuse surface of its base colour ({n} materials)")
         return albedo
     inputs.warn("metal is rendered without its reflection ({n} materials)")
@@ -392,6 +484,7 @@ def _evaluated(
     opacity: ShadingValue,
     threshold: float,
     normal: ShadingValue | None,
+    gloss: Gloss | None = None,
 ) -> EvaluatedMaterial | None:
     """The evaluated material with an albedo in [0, 1] and a non-negative emission; None: opacity is 0."""
     rounding = 1e-6 if albedo.reads else 0.0
@@ -439,6 +532,7 @@ def _evaluated(
         emission_texture,
         opacity_texture,
         normal_texture=None if normal is None else network.texture(normal),
+        gloss=gloss,
     )
     albedo_value, emission_value, opacity_value = (x if x.reads else None for x in (albedo, emission, opacity))
     return EvaluatedMaterial(
@@ -463,6 +557,9 @@ def with_baked(evaluated: EvaluatedMaterial, what: str, value: ShadingValue, ima
     material = evaluated.material
     if what == "albedo":
         material = replace(material, albedo=_rgb(value.mean), albedo_texture=texture)
+        if material.gloss is not None and material.gloss.base_color_texture is None:
+            gloss = replace(material.gloss, base_color=material.albedo, base_color_texture=texture)
+            material = replace(material, gloss=gloss)
     elif what == "emission":
         emits = value.highest > 0.0
         material = replace(material, emission=_rgb(value.mean), emission_texture=texture if emits else None)
