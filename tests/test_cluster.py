@@ -123,10 +123,10 @@ def assert_same(one, other):
 def test_a_node_and_a_worker_are_shot_and_one_is_added(cluster, executor):
     """Over a full object store too, the picture has the bits of an undisturbed one, and parts wait in order.
 
-    The films of the 24 parts are 12 MB each, the run-ahead is 8 of them: more than a node's store holds beside the
-    scene and what Ray itself stores there, so that some are written to disk.
+    The films of the 14 parts are 27 MB each, and eight of them are ahead of the one that is added next: more than two
+    nodes' stores hold, so that some are written to disk.
     """
-    settings = {"width": 320, "max_bounces": 0, "light_paths": 16, "iterations": 24}
+    settings = {"width": 480, "max_bounces": 0, "light_paths": 16, "iterations": 14}
     doomed = add_node(cluster)
     (first,) = [node for node in cluster.worker_nodes if node is not doomed]
     happened = []
@@ -135,13 +135,14 @@ def test_a_node_and_a_worker_are_shot_and_one_is_added(cluster, executor):
         if progress.iterations == 2:
             os.kill(wait_for(lambda: workers_of(first))[0], signal.SIGKILL)
             happened.append("worker")
-        if progress.iterations == 5:
+        if progress.iterations == 4:
             wait_for(lambda: workers_of(doomed))
             cluster.remove_node(doomed, allow_graceful=False)
             happened.append("node")
-        if progress.iterations == 8:
+        if progress.iterations == 6:
             add_node(cluster)
-            time.sleep(3.0)  # meanwhile films gather in the stores
+            # Meanwhile films gather in the stores.
+            wait_for(lambda: list(Path(cluster.head_node.get_session_dir_path()).glob("ray_spilled_objects*/*")))
             happened.append("added")
 
     disturbed = render(executor, settings, disturb, size=1)
