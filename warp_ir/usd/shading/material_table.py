@@ -359,11 +359,9 @@ class MaterialTable:
             color = self._from_primvars(prim, shape, surface.albedo, "albedo", 1.0)
             if color is None and surface.albedo is not None and material.albedo_texture is None:
                 lacking.append((chosen, surface.albedo))
-            if color is not None:
-                material = self._note_lost_texture(material, replace(material, albedo_texture=None))
-                if color.ndim == 1:
-                    red, green, blue = color.tolist()
-                    material = replace(material, albedo=(red, green, blue))
+            if color is not None and color.ndim == 1:
+                red, green, blue = color.tolist()
+                material = replace(material, albedo=(red, green, blue))
             index[chosen] = self._primvar_variants(prim, shape, surface, material)[chosen]
             if k in self.displacements:
                 self.displacements.update(dict.fromkeys(np.unique(index[chosen]).tolist(), self.displacements[k]))
@@ -385,12 +383,6 @@ class MaterialTable:
             colors = np.where(chosen[:, None, None], assigned.colors, colors)
         return replace(assigned, colors=colors)
 
-    def _note_lost_texture(self, material: Material, plain: Material) -> Material:
-        """Returns `plain`; warns if it differs from the material, one of whose textures its mean replaces."""
-        if plain != material:
-            self._report.warn(material.name, "its texture is replaced by its mean where primvars are read")
-        return plain
-
     def _primvar_variants(
         self, prim: Usd.Prim, shape: TriangleMesh, surface: EvaluatedMaterial, material: Material
     ) -> Ints:
@@ -405,11 +397,9 @@ class MaterialTable:
         rows = np.empty((count, 4), np.float32)
         rows[:, :3], rows[:, 3] = material.emission, material.opacity
         if emission is not None:
-            material = self._note_lost_texture(material, replace(material, emission_texture=None))
             rows[:, :3] = self._triangle_means(prim, emission, "emission")
         if opacity is not None:
             material = replace(material, cutoff=0.0)
-            material = self._note_lost_texture(material, replace(material, opacity_texture=None))
             rows[:, 3] = self._triangle_means(prim, opacity, "opacity")[..., 0]
             if surface.threshold > 0.0:
                 rows[:, 3] = rows[:, 3] >= surface.threshold
