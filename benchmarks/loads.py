@@ -22,7 +22,7 @@ from report import Table, environment, number, publish
 from scaling import room, used_memory
 
 import warp_ir as ir
-from warp_ir.device_scene.validate import _BYTES_PER_INSTANCE, _BYTES_PER_TRIANGLE
+from warp_ir.device_scene.validate import upload_bytes
 from warp_ir.memory import pixel_bytes, scene_bytes
 from warp_ir.procedural import cornell_box, mesh, sphere
 from warp_ir.renderer import Renderer
@@ -91,13 +91,11 @@ def measure(name: str) -> dict[str, float]:
     assert np.isfinite(picture).all() and picture.max() > 0.0
     count = picture.shape[0] * picture.shape[1]
     film_bytes = count * pixel_bytes(scene, renderer.settings, guided=False)
-    copies = sum(len(group.matrices) for group in scene.instances)
-    upload = _BYTES_PER_TRIANGLE * scene.triangle_count + _BYTES_PER_INSTANCE * copies
     resident = sum(scene_bytes(scene).values()) + film_bytes
     return {
         "predicted": resident,
         "resident": used_memory(wp.get_device("cpu")) - before,
-        "predicted_peak": max(upload + film_bytes, resident),
+        "predicted_peak": max(upload_bytes(scene) + film_bytes, resident),
         "peak": max(peak_memory() - before, 0),
         "upload": uploaded - start,
         "iteration": (rendered - uploaded) / 2,

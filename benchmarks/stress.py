@@ -43,7 +43,7 @@ class Finding:
     @property
     def holds(self) -> bool:
         """Whether the limit is kept; a value that is no number keeps none."""
-        return self.value <= self.limit
+        return bool(self.value <= self.limit)
 
 
 CASES: dict[str, Callable[[str, int], Finding]] = {}
@@ -463,7 +463,7 @@ def drift(estimator: str, iterations: int) -> Finding:
         lit.add_iteration(films[1], iteration)
     moved_bits = float((films[0].radiance() != np.float32(1.0 / 3.0)).sum())
     mean, error = (float(x.astype(np.float64).mean()) for x in (films[1].radiance(), films[1].standard_error()))
-    return Finding(moved_bits + abs(mean - 2.0) / error, 5.0, "standard errors")
+    return Finding(float(moved_bits + abs(mean - 2.0) / error), 5.0, "standard errors")
 
 
 @_case("10^5 iterations")

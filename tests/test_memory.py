@@ -299,6 +299,14 @@ def test_what_is_too_large_is_refused_with_the_numbers(tmp_path, monkeypatch):
     memory.require_memory(60_000_000, "what is small is not looked at: it would")
 
 
+def test_a_sky_that_does_not_fit_is_refused(monkeypatch):
+    """What the upload of 2²⁰ texels takes at its peak is asked for before anything is allocated."""
+    monkeypatch.setattr(Launcher, "memory", lambda self: 2.0**25)
+    sky = ir.Light("sky", LightKind.DOME, (1.0,) * 3, texture=np.ones((512, 2048, 3), np.float32))
+    with pytest.raises(ir.InputError, match=r"1048576 texels of lights need about 0\.1 GiB, cpu has 0\.0 GiB"):
+        upload_scenes((ir.Scene(lights=(sky,)),), Launcher("cpu"))
+
+
 LIMITED = ["render", str(ROOM), "a.npy", "--iterations", "1", "--light-paths", "64"]
 
 

@@ -16,6 +16,8 @@ MAX_TRIANGLES = 200_000_000
 _BYTES_PER_TRIANGLE = 300
 _BYTES_PER_INSTANCE = 560
 """Memory of the upload, at its peak: measured for ten million of each."""
+_BYTES_PER_LIGHT_TEXEL = 53
+"""The same for the texels of lights, of which cumulative probabilities are made: measured for 16384 x 8192."""
 _MAX_EXPOSED_RADIANCE = 1.0e38
 """Largest radiance times exposure, which a film stores as float32."""
 _MAX_NORMAL_COMPONENT = 1.0e6
@@ -45,11 +47,12 @@ def check_scene(scene: Scene, launcher: Launcher, checked: Collection[int], prev
     if triangles > MAX_TRIANGLES:
         copies = f", {copied} of them copies of instances that emit" if copied else ""
         raise InputError(f"scene: {triangles} triangles{copies}; the limit is {MAX_TRIANGLES}")
-    needed, *before = (_BYTES_PER_TRIANGLE * n + _BYTES_PER_INSTANCE * k for n, _, k in map(_sizes, (scene, *previous)))
+    needed, *before = map(upload_bytes, (scene, *previous))
     held = max(before, default=0)
     if needed > held and needed > (available := launcher.memory() + held):
+        texels = f" and {count} texels of lights" if (count := _light_texels(scene)) else ""
         raise InputError(
-            f"scene: {triangles} triangles and {instances} instances need about {gibibytes(needed)},"
+            f"scene: {triangles} triangles and {instances} instances{texels} need about {gibibytes(needed)},"
             f" {launcher.device} has {gibibytes(available)}"
         )
     for material in scene.materials:
@@ -145,6 +148,19 @@ def _check_instances(scene: Scene) -> None:
         if group.colors is not None:
             demand(group.colors.shape == (count, 3), "colors must have shape [k, 3], one per instance")
             demand(group.colors.min() >= 0.0 and group.colors.max() <= 1.0, "colors must lie in [0, 1]")
+
+
+def upload_bytes(scene: Scene) -> int:
+    """What the upload of a scene takes at its peak, beside the scene itself [bytes]."""
+    triangles, _, instances = _sizes(scene)
+    texels = _BYTES_PER_LIGHT_TEXEL * _light_texels(scene)
+    return _BYTES_PER_TRIANGLE * triangles + _BYTES_PER_INSTANCE * instances + texels
+
+
+def _light_texels(scene: Scene) -> int:
+    """Number of texels of the lights' images, each counted once."""
+    images = {id(light.texture): light.texture for light in scene.lights if light.texture is not None}
+    return sum(image.size // 3 for image in images.values())
 
 
 def _sizes(scene: Scene) -> tuple[int, int, int]:
