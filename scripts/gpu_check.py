@@ -153,7 +153,7 @@ def _gather(scene: Any, way: str, device: str, iterations: int, **settings: Any)
             renderer.add_iteration(film, k)
         seconds = (time.perf_counter() - begin) / (iterations - warm_up)
         gathering = launcher.profile.since(phases)["gather"] / (iterations - warm_up)
-        renderer._report_profile(film)
+        renderer.report_profile(film)
     finally:
         for name, value in before.items():
             setattr(wavefront, name, value)

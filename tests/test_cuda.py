@@ -176,7 +176,7 @@ def test_iterations_read_nothing_back(scene, settings, capacity, monkeypatch):
         for iteration in range(1, 3):
             renderer.add_iteration(film, iteration)
             assert len(waits) == iteration  # when it is done
-    renderer._report_profile(film)
+    renderer.report_profile(film)
     np.testing.assert_array_equal(film.radiance(), expected.radiance())
     assert film.counts == expected.counts
     if capacity is not None:

@@ -32,7 +32,7 @@ def rendered(renderer):
     film = renderer.new_film()
     for iteration in range(film.settings.iterations):
         renderer.add_iteration(film, iteration)
-    renderer._report_profile(film)
+    renderer.report_profile(film)
     return film
 
 

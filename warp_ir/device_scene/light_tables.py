@@ -82,7 +82,9 @@ def upload_lights(
     # Larger than the shape by more than rounding: rays must reach the box of a lamp that lies in a surface before it.
     spans = axes[shapes].copy()
     spans[[lights[k].kind <= LightKind.DISK for k in shapes], :, 2] = 0.0  # flat: nothing of it lies off its plane
-    reach = np.abs(spans).sum(axis=2) * 1.001 + np.abs(centre) * 2.0**-18 if shapes else np.zeros((1, 3))
+    # The error of a ray's distance is relative to the scene, from all of which rays come.
+    reach = np.abs(spans).sum(axis=2) * 1.001 if shapes else np.zeros((1, 3))
+    reach += 2.0**-18 * (np.abs(centre) + data.radius)
     data.shape_count = len(shapes)
     data.shape_light = launcher.array(shapes or [0], wp.int32)
     bvh = wp.Bvh(launcher.array(centre - reach, wp.vec3), launcher.array(centre + reach, wp.vec3))

@@ -13,7 +13,7 @@ from typing import ClassVar
 import warp as wp
 
 import warp_ir.gbuffer
-from warp_ir.bsdf import AlbedoTable, Bsdf, BsdfSample, bsdf_pdf, directional_albedo, evaluate, sample_bsdf
+from warp_ir.bsdf import Bsdf, BsdfSample, bsdf_pdf, directional_albedo, evaluate, sample_bsdf
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import CameraData, SceneData
 from warp_ir.estimators.path import PathTracer
@@ -58,7 +58,6 @@ class _Vertex:
     x: ShadingPoint
     bsdf: Bsdf
     to_eye: wp.vec3  # in the frame of the shading normal
-    table: AlbedoTable
 
 
 @wp.func
@@ -87,7 +86,6 @@ def _vertex(scene: SceneData, hit: Hit, direction: wp.vec3, smooth: bool, footpr
         out.x.shading_normal = wp.normalize(out.x.shading_normal + direction * (cosine - _LEAST_COSINE))
     out.to_eye = _to_local(-direction, out.x.shading_normal)
     out.bsdf = bsdf_at(scene.address, hit, footprint)
-    out.table = scene.surface_textures[0].gloss.albedo
     return out
 
 
@@ -95,11 +93,12 @@ def _vertex(scene: SceneData, hit: Hit, direction: wp.vec3, smooth: bool, footpr
 def _reflected_light(address: wp.uint64, v: _Vertex, u: float, u2: wp.vec2) -> wp.vec3:
     """MIS-weighted radiance reflected to the eye, from one sample of the lights."""
     scene = scene_at(address)[0]
+    table = scene.surface_textures[0].gloss.albedo
     light = sample_direct(scene, v.x.position, u, u2)
     if wp.max(light.radiance) <= 0.0 or wp.dot(v.x.normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
     to_light = _to_local(light.direction, v.x.shading_normal)
-    reflected = evaluate(v.bsdf, v.table, to_light, v.to_eye) * to_light[2]
+    reflected = evaluate(v.bsdf, table, to_light, v.to_eye) * to_light[2]
     if wp.max(reflected) <= 0.0:
         return wp.vec3(0.0)
     visibility = light_visibility(scene, light.modifier_row, v.x, light.target)
@@ -107,14 +106,15 @@ def _reflected_light(address: wp.uint64, v: _Vertex, u: float, u2: wp.vec2) -> w
         return wp.vec3(0.0)
     weight = float(1.0)
     if light.pdf > 0.0 and not is_below(v.x, light.direction):
-        weight = power_heuristic(light.pdf, bsdf_pdf(v.bsdf, v.table, to_light, v.to_eye))
+        weight = power_heuristic(light.pdf, bsdf_pdf(v.bsdf, table, to_light, v.to_eye))
     return wp.cw_mul(wp.cw_mul(light.radiance, visibility), reflected) * weight
 
 
 @wp.func(inline=False)
-def _next_direction(v: _Vertex, u_lobe: float, u2: wp.vec2) -> BsdfSample:
+def _next_direction(address: wp.uint64, v: _Vertex, u_lobe: float, u2: wp.vec2) -> BsdfSample:
     """A sampled direction in world space; (0, 0, 0): the path ends."""
-    sample = sample_bsdf(v.bsdf, v.table, v.to_eye, u_lobe, u2)
+    table = scene_at(address)[0].surface_textures[0].gloss.albedo
+    sample = sample_bsdf(v.bsdf, table, v.to_eye, u_lobe, u2)
     if wp.length_sq(sample.direction) == 0.0:
         return sample
     direction = wp.normalize(from_local(sample.direction, v.x.shading_normal))
@@ -197,14 +197,16 @@ def _trace_glossy_paths(
         while wp.max(throughput) > 0.0:
             v = _vertex(scene, hit, direction, smooth, footprint)
             if bounce == 0:
-                albedo = wp.max(directional_albedo(v.bsdf, v.table, v.to_eye[2]), wp.vec3(1.0e-6))
+                albedo = wp.max(
+                    directional_albedo(v.bsdf, scene.surface_textures[0].gloss.albedo, v.to_eye[2]), wp.vec3(1.0e-6)
+                )
             u = sobol.sample_1d(scene.sobol, 0, dimension, stream)
             u2 = sobol.sample_2d(scene.sobol, 0, dimension + 1, stream)
             radiance = wp.cw_mul(throughput, _reflected_light(scene.address, v, u, u2))
 
             u = sobol.sample_1d(scene.sobol, 0, dimension + 5, stream)
             u2 = sobol.sample_2d(scene.sobol, 0, dimension + 3, stream)
-            next = _next_direction(v, u, u2)
+            next = _next_direction(scene.address, v, u, u2)
             direction = next.direction
             goes_on = wp.length_sq(direction) > 0.0
             if goes_on:
