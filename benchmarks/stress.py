@@ -1,4 +1,4 @@
-"""What is hard on numbers: tiny, huge and far scenes, walls without thickness, slivers, lights of any size and power.
+"""Cases that are hard on numbers: tiny, huge and far scenes, thin walls, slivers, lights of any size and power.
 
     python benchmarks/stress.py [-k WORD ...] [--estimators NAME ...] [--seeds N] [--json FILE] [--markdown FILE]
 

@@ -236,7 +236,7 @@ def test_the_picture_does_not_depend_on_who_renders_what(settings, more):
 
 @pytest.mark.extended
 def test_tiles_know_what_they_have_left_out():
-    """Of every tile the device knows how many iterations left it out, in a film alone and in that of a part.
+    """The device knows how many iterations left out each tile, in a film alone and in that of a part.
 
     The pixels' samples are numbered by it.
     """

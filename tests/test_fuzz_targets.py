@@ -21,7 +21,7 @@ FAST = [pytest.param(name, marks=pytest.mark.extended if name == "film" else ())
 
 @pytest.mark.parametrize("name", FAST)
 def test_parsers_keep_their_promise(name):
-    """What is sound, empty, or damaged at random is read, or refused by the error that the parser promises."""
+    """A parser reads sound, empty and randomly damaged input, or refuses it by the error that it promises."""
     if name == "mtlx":
         pytest.importorskip("MaterialX")
     _try(name, 10 if name in ("film", "ies") else 50)

@@ -166,6 +166,13 @@ def first_hit(scene: SceneData, camera: CameraData, ray: Ray) -> Hit:
 
 
 @wp.func
+def pixel_width(camera: CameraData, depth: float) -> float:
+    """Width of a pixel on a surface that faces the camera at a depth."""
+    width = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
+    return width * wp.where(camera.orthographic == 1, 1.0, depth)
+
+
+@wp.func
 def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHit:
     """Traces a camera ray, and evaluates the surface that it hits."""
     interval = _clip_interval(camera, ray)
@@ -185,8 +192,7 @@ def trace_camera_ray(scene: SceneData, camera: CameraData, ray: Ray) -> CameraHi
         hit_record.shading_normal = shading_normal(scene, hit)
         hit_record.smooth_height = smooth_height(scene, hit, hit_record.shading_normal)
         hit_record.depth = hit.t + near
-        pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
-        pixel *= wp.where(camera.orthographic == 1, 1.0, hit_record.depth)
+        pixel = pixel_width(camera, hit_record.depth)
         hit_record.smooth_normal = hit_record.shading_normal
         hit_record.shading_normal = mapped_normal(scene, hit, hit_record.smooth_normal, pixel)
         hit_record.albedo = albedo(scene, hit, pixel)

@@ -1,4 +1,4 @@
-"""What is hard on numbers: the cases of benchmarks/stress.py, with few seeds; the program itself takes more."""
+"""The cases of benchmarks/stress.py, which are hard on numbers, with few seeds; the program itself takes more."""
 
 import sys
 from dataclasses import replace

@@ -31,7 +31,7 @@ class Part:
 
     @property
     def iterations(self) -> range:
-        """Those of the part."""
+        """Numbers of the part's iterations."""
         return range(self.total * (self.number - 1) // self.parts, self.total * self.number // self.parts)
 
     def __str__(self) -> str:

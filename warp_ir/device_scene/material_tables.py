@@ -7,7 +7,7 @@ import warp as wp
 from warp_ir.bsdf import upload_albedo_table
 from warp_ir.device.launcher import Launcher
 from warp_ir.device_scene.scene_data import GlossRow, GlossTables, SceneData, SurfaceTextures
-from warp_ir.scene import Material, Texture
+from warp_ir.scene import TEXTURED_GLOSS, Material, Texture
 from warp_ir.texture import TextureTable
 
 LARGEST_UV = 1.0e6
@@ -69,7 +69,7 @@ def _gloss_tables(materials: tuple[Material, ...], row: dict[Texture | None, int
                 wp.vec3(*gloss.base_color),
                 wp.vec3(*(gloss.specular_color or (0,) * 3)),
             )
-            for name in ("base_color", "metallic", "specular_color", "roughness", "clearcoat", "clearcoat_roughness"):
+            for name in TEXTURED_GLOSS:
                 setattr(out, f"{name}_texture", row[getattr(gloss, f"{name}_texture")])
         rows.append(out)
     tables = GlossTables()

@@ -17,7 +17,7 @@ _BYTES_PER_TRIANGLE = 300
 _BYTES_PER_INSTANCE = 560
 """Memory of the upload, at its peak: measured for ten million of each."""
 _BYTES_PER_LIGHT_TEXEL = 53
-"""The same for the texels of lights, of which cumulative probabilities are made: measured for 16384 x 8192."""
+"""Memory of the upload, at its peak, for a texel of a light's image and its cumulative probabilities: measured."""
 _MAX_EXPOSED_RADIANCE = 1.0e38
 """Largest radiance times exposure, which a film stores as float32."""
 _MAX_NORMAL_COMPONENT = 1.0e6

@@ -29,7 +29,7 @@ class Tasks(Protocol[Work]):
         """Starts a piece; fewer than `slots` are running."""
 
     def finished(self, running: Sequence[Hashable], seconds: float, /) -> Iterable[Hashable]:
-        """Those of the handles that have finished, after waiting for the first one for so long at most."""
+        """The handles of finished parts, after waiting for the first one for `seconds` at most."""
 
     def cancel(self, handles: Iterable[Hashable], /) -> None:
         """Ends pieces whose results nobody needs any more."""

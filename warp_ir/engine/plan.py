@@ -21,7 +21,7 @@ _TILE_PIXELS = 1 << 20
 _SAMPLES = {"cpu": 1 << 21, "cuda": 1 << 27}
 """Samples (pixels times iterations) of a part by kind of device: some ten seconds of a core, or one of a GPU."""
 _ROUND_SAMPLES = {"cpu": 1 << 19, "cuda": 1 << 25}
-"""The same where decisions are taken between rounds, which are short at first."""
+"""Samples of a part where decisions are taken between rounds, which are short at first."""
 _LEAST_ITERATIONS = 16
 """Of a part where there are as many: its film is sent and added once, however many iterations it holds."""
 _MOST_PARTS = 1024

@@ -1,7 +1,7 @@
 """Path tracing where surfaces reflect by direction (`bsdf/reflection.py`).
 
-As there, every vertex samples one light, and the sampled direction may hit an emitter as well. A mirror samples no
-light: what its direction hits counts in full. Shading normals count where the camera sees a surface, directly or by
+As in `path.py`, every vertex samples one light, and the sampled direction may hit an emitter as well. A mirror samples
+no light: what its direction hits counts in full. Shading normals count where the camera sees a surface, directly or by
 reflections in gloss and mirrors, geometric normals at all vertices after a diffuse reflection.
 """
 
@@ -16,17 +16,11 @@ import warp_ir.gbuffer
 from warp_ir.bsdf import Bsdf, BsdfSample, bsdf_pdf, directional_albedo, evaluate, sample_bsdf
 from warp_ir.device.launcher import MAX_REGISTERS
 from warp_ir.device_scene import CameraData, SceneData
-from warp_ir.estimators.path import PathTracer
-from warp_ir.gbuffer import GBuffer, camera_ray, first_hit, image_pixel, jitter, lens_point, trace_primary
-from warp_ir.lights import (
-    intersect_lights,
-    light_visibility,
-    power_heuristic,
-    sample_direct,
-    surface_emission_mis,
-)
+from warp_ir.estimators.path import PathTracer, emission_along, survival
+from warp_ir.gbuffer import GBuffer, camera_ray, first_hit, image_pixel, jitter, lens_point, pixel_width, vertex_of_hit
+from warp_ir.lights import light_visibility, power_heuristic, sample_direct
 from warp_ir.sampling import sobol
-from warp_ir.sampling.square_to import from_local
+from warp_ir.sampling.square_to import from_local, to_local
 from warp_ir.surface import (
     Hit,
     ShadingPoint,
@@ -36,17 +30,13 @@ from warp_ir.surface import (
     is_below,
     mapped_normal,
     scene_at,
-    shading_normal,
     shading_point,
     shadow_ray_origin,
-    smooth_height,
 )
 from warp_ir.tiles import indices, pixel_at, skipped_iterations
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_MAX_SURVIVAL = wp.constant(0.999)
-_ROULETTE_THROUGHPUT = wp.constant(0.25)
 _LEAST_COSINE = wp.constant(1.0e-3)  # of the view to a shading normal, which is turned until then
 _DIMENSIONS = wp.constant(8)  # of the sequence, for a vertex
 
@@ -61,30 +51,18 @@ class _Vertex:
 
 
 @wp.func
-def _to_local(v: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """The inverse of `from_local`."""
-    x = from_local(wp.vec3(1.0, 0.0, 0.0), n)
-    y = from_local(wp.vec3(0.0, 1.0, 0.0), n)
-    return wp.vec3(wp.dot(v, x), wp.dot(v, y), wp.dot(v, n))
-
-
-@wp.func
 def _vertex(scene: SceneData, hit: Hit, direction: wp.vec3, smooth: bool, footprint: float) -> _Vertex:
     """What a ray in a unit direction hits; `smooth`: by its shading normal, as the camera sees it."""
     out = _Vertex()
     out.x = shading_point(scene, hit)
     if smooth:
-        n = shading_normal(scene, hit)
-        out.x.smooth_height = smooth_height(scene, hit, n)
-        if out.x.smooth_height > 0.0:
-            out.x.normal = n
-        out.x.shading_normal = mapped_normal(scene, hit, n, footprint)
-        out.x.from_camera = True
+        out.x = vertex_of_hit(scene, hit)
+        out.x.shading_normal = mapped_normal(scene, hit, out.x.shading_normal, footprint)
     # A normal that is turned away from the eye would reflect nothing to it.
     cosine = -wp.dot(out.x.shading_normal, direction)
     if cosine < _LEAST_COSINE:
         out.x.shading_normal = wp.normalize(out.x.shading_normal + direction * (cosine - _LEAST_COSINE))
-    out.to_eye = _to_local(-direction, out.x.shading_normal)
+    out.to_eye = to_local(-direction, out.x.shading_normal)
     out.bsdf = bsdf_at(scene.address, hit, footprint)
     return out
 
@@ -97,7 +75,7 @@ def _reflected_light(address: wp.uint64, v: _Vertex, u: float, u2: wp.vec2) -> w
     light = sample_direct(scene, v.x.position, u, u2)
     if wp.max(light.radiance) <= 0.0 or wp.dot(v.x.normal, light.direction) <= 0.0:
         return wp.vec3(0.0)
-    to_light = _to_local(light.direction, v.x.shading_normal)
+    to_light = to_local(light.direction, v.x.shading_normal)
     reflected = evaluate(v.bsdf, table, to_light, v.to_eye) * to_light[2]
     if wp.max(reflected) <= 0.0:
         return wp.vec3(0.0)
@@ -134,19 +112,7 @@ def _emission_of_ray(
     address: wp.uint64, x: ShadingPoint, origin: wp.vec3, direction: wp.vec3, hit: Hit, pdf: float
 ) -> wp.vec3:
     """MIS-weighted emission that a ray meets; `pdf` is -1 for a ray that only a mirror can send."""
-    scene = scene_at(address)[0]
-    t_max = wp.where(hit.triangle < 0, 3.0e38, hit.t)
-    emitted = intersect_lights(scene, origin, direction, t_max, hit.triangle < 0, pdf, x.mesh)
-    if hit.triangle >= 0:
-        emitted += surface_emission_mis(scene, hit, direction, pdf, x.mesh)
-    return emitted
-
-
-@wp.func
-def _footprint(camera: CameraData, depth: float) -> float:
-    """Width of a pixel on a surface that faces the camera."""
-    pixel = wp.sqrt(camera.width * camera.height / float(camera.image_columns * camera.image_rows))
-    return pixel * wp.where(camera.orthographic == 1, 1.0, depth)
+    return emission_along(scene_at(address)[0], x, origin, direction, hit, pdf, 0.0)
 
 
 @wp.func
@@ -193,7 +159,7 @@ def _trace_glossy_paths(
         bounce = int(0)
         dimension = int(0)
         smooth = bool(True)
-        footprint = _footprint(camera, gbuffer.depth[pixel])
+        footprint = pixel_width(camera, gbuffer.depth[pixel])
         while wp.max(throughput) > 0.0:
             v = _vertex(scene, hit, direction, smooth, footprint)
             if bounce == 0:
@@ -230,10 +196,10 @@ def _trace_glossy_paths(
                 smooth = sobol.sample_1d(scene.sobol, 0, dimension + 7, stream) >= share
                 part = _part_of(next, smooth, wp.where(smooth, 1.0 - share, share))
                 throughput = wp.cw_mul(throughput, part)
-            survival = wp.min(wp.max(throughput) / _ROULETTE_THROUGHPUT, _MAX_SURVIVAL)
-            if sobol.sample_1d(scene.sobol, 0, dimension + 6, stream) >= survival:
+            lives = survival(throughput)
+            if sobol.sample_1d(scene.sobol, 0, dimension + 6, stream) >= lives:
                 break
-            throughput = throughput / survival
+            throughput = throughput / lives
             footprint = scene.footprint
             dimension += _DIMENSIONS
     gbuffer.albedo[pixel] = albedo
@@ -246,23 +212,8 @@ class GlossyPathTracer(PathTracer):
 
     MODULES: ClassVar[Sequence[ModuleType]] = (warp_ir.gbuffer, sys.modules[__name__])
 
-    def estimate(self, iteration: int, gbuffer: GBuffer) -> None:
-        """Fills the G-buffer; irradiance is relative to the albedo of the view, by which it replaces the albedo."""
-        settings, launcher = self._settings, self._launcher
-        self.prepare(iteration)
-        with launcher.phase("primary"):
-            trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
-        with launcher.phase("gather"):
-            launcher.launch(
-                _trace_glossy_paths,
-                indices(gbuffer.tiles),
-                [
-                    self._scene.data,
-                    self._camera,
-                    gbuffer,
-                    self._iteration,
-                    wp.uint32(settings.seed),
-                    self._scramble,
-                    settings.max_bounces,
-                ],
-            )
+    def _trace_paths(self, gbuffer: GBuffer) -> None:
+        """Traces a path from every pixel; irradiance is over the albedo of the view, which replaces the albedo."""
+        scene, settings = self._scene.data, self._settings
+        numbers = self._iteration, wp.uint32(settings.seed), self._scramble, settings.max_bounces
+        self._launcher.launch(_trace_glossy_paths, indices(gbuffer.tiles), [scene, self._camera, gbuffer, *numbers])

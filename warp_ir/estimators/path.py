@@ -136,7 +136,13 @@ def _light_of_spot(address: wp.uint64, x: ShadingPoint, stream: wp.uint32, max_r
 
 
 @wp.func
-def _emission_along(
+def survival(throughput: wp.vec3) -> float:
+    """The probability with which Russian roulette lets a path go on."""
+    return wp.min(wp.max(throughput) / _ROULETTE_THROUGHPUT, _MAX_SURVIVAL)
+
+
+@wp.func
+def emission_along(
     scene: SceneData, x: ShadingPoint, origin: wp.vec3, direction: wp.vec3, hit: Hit, pdf: float, nearest: float
 ) -> wp.vec3:
     """MIS-weighted emission that a ray meets, not nearer than `nearest`."""
@@ -194,7 +200,7 @@ def _trace_paths(
         origin = shadow_ray_origin(x, wp.vec4(direction[0], direction[1], direction[2], 0.0))
         hit = closest(scene, origin, direction, 3.0e38)
         if above and not is_below(x, direction):
-            emitted = _emission_along(scene, x, origin, direction, hit, pdf, nearest)
+            emitted = emission_along(scene, x, origin, direction, hit, pdf, nearest)
             radiance += wp.cw_mul(throughput, emitted)
         if bounce == 0:
             direct += radiance
@@ -206,10 +212,10 @@ def _trace_paths(
             break
         rho = albedo(scene, hit, scene.footprint)
         throughput = wp.cw_mul(throughput, rho) * geometry_term_of_hit(x, direction, hit)[1]
-        survival = wp.min(wp.max(throughput) / _ROULETTE_THROUGHPUT, _MAX_SURVIVAL)
-        if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= survival:
+        goes_on = survival(throughput)
+        if sobol.sample_1d(scene.sobol, 0, dimension + 5, stream) >= goes_on:
             break
-        throughput = throughput / survival
+        throughput = throughput / goes_on
         if has_spots == 1:
             length = wp.length(hit.position - x.position)
             spot_distance = wp.max(length, wp.where(spot_distance > _SPOT_DISTANCE * length, spot_distance, 0.0))
@@ -267,15 +273,10 @@ class PathTracer:
         with launcher.phase("primary"):
             trace_primary(self._scene, self._camera, launcher, gbuffer, iteration=self._iteration, seed=settings.seed)
         with launcher.phase("gather"):
-            launcher.launch(
-                _trace_paths,
-                indices(gbuffer.tiles),
-                [
-                    self._scene.data,
-                    self._camera,
-                    gbuffer,
-                    self._scramble,
-                    settings.max_bounces,
-                    int(self._has_spots),
-                ],
-            )
+            self._trace_paths(gbuffer)
+
+    def _trace_paths(self, gbuffer: GBuffer) -> None:
+        """Traces a path from every pixel of the G-buffer, for its irradiance."""
+        spots = int(self._has_spots)
+        arguments = [self._scene.data, self._camera, gbuffer, self._scramble, self._settings.max_bounces, spots]
+        self._launcher.launch(_trace_paths, indices(gbuffer.tiles), arguments)

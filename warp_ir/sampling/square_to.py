@@ -17,6 +17,14 @@ def from_local(v: wp.vec3, n: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def to_local(v: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """The inverse of `from_local`."""
+    x = from_local(wp.vec3(1.0, 0.0, 0.0), n)
+    y = from_local(wp.vec3(0.0, 1.0, 0.0), n)
+    return wp.vec3(wp.dot(v, x), wp.dot(v, y), wp.dot(v, n))
+
+
+@wp.func
 def square_to_disk(u: wp.vec2) -> wp.vec2:
     """A uniform point of the unit disk, by the concentric map (Shirley and Chiu 1997)."""
     a = 2.0 * u[0] - 1.0

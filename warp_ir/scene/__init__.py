@@ -6,6 +6,7 @@ from warp_ir.scene.measure import materials_of, triangle_areas
 from warp_ir.scene.scene import Scene
 from warp_ir.scene.types import (
     MAX_RADIANCE,
+    TEXTURED_GLOSS,
     Bools,
     Color,
     Floats,
@@ -27,6 +28,7 @@ __all__ = [
     "CONFORM_POLICIES",
     "MAX_CLIPPING_PLANES",
     "MAX_RADIANCE",
+    "TEXTURED_GLOSS",
     "Bools",
     "Camera",
     "Color",

@@ -112,6 +112,10 @@ class Texture:
         return red, green, blue
 
 
+TEXTURED_GLOSS = ("base_color", "metallic", "specular_color", "roughness", "clearcoat", "clearcoat_roughness")
+"""Parameters of `Gloss` that may have a texture, in the field of that name and `_texture`."""
+
+
 @dataclass(frozen=True)
 class Gloss:
     """How a surface reflects by direction: microfacets over a diffuse base, below a clearcoat (UsdPreviewSurface).
@@ -144,26 +148,15 @@ class Gloss:
     clearcoat_roughness_texture: Texture | None = None
 
     def __post_init__(self) -> None:
-        for name in ("base_color", "specular_color"):
+        for name in TEXTURED_GLOSS:
             image = getattr(self, f"{name}_texture")
             if image is not None:
-                object.__setattr__(self, name, image.mean)
-        for name in ("metallic", "roughness", "clearcoat", "clearcoat_roughness"):
-            image = getattr(self, f"{name}_texture")
-            if image is not None:
-                object.__setattr__(self, name, image.mean[0])
+                object.__setattr__(self, name, image.mean if name.endswith("color") else image.mean[0])
 
     @property
     def textures(self) -> tuple[Texture, ...]:
         """All textures of these parameters."""
-        images = (
-            self.base_color_texture,
-            self.metallic_texture,
-            self.specular_color_texture,
-            self.roughness_texture,
-            self.clearcoat_texture,
-            self.clearcoat_roughness_texture,
-        )
+        images = (getattr(self, f"{name}_texture") for name in TEXTURED_GLOSS)
         return tuple(image for image in images if image is not None)
 
 
